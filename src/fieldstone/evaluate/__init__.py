@@ -1,0 +1,1 @@
+"""Numbers about results: image metrics and reconstruction metrics."""

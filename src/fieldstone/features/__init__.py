@@ -1,0 +1,1 @@
+"""Images to features, features to a match graph."""

@@ -1,0 +1,1 @@
+"""A reconstruction and its photos to a radiance field."""

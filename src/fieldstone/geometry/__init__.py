@@ -1,0 +1,1 @@
+"""Pure mathematics on arrays: rotations, transforms, cameras, epipolar geometry, triangulation."""

@@ -1,0 +1,1 @@
+"""A match graph to reconstructions."""

@@ -1,0 +1,1 @@
+"""A radiance field to views, camera paths and meshes."""

@@ -1,0 +1,1 @@
+"""Figures of every stage and the self-contained report."""

@@ -1,0 +1,1 @@
+"""The nouns: features, match graphs, tracks, reconstructions, rays, meshes."""

@@ -1,0 +1,50 @@
+"""Viewing rays of a posed camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.geometry.camera import Camera, bearings_from_image
+from fieldstone.geometry.rigid3 import Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays in the world: x(t) = origin + t direction, |direction| = 1.
+
+    pixel_radius: half the width of the pixel's cone at t = 1, in scene units.
+    """
+
+    origins: Float[np.ndarray, "r 3"]
+    directions: Float[np.ndarray, "r 3"]
+    pixel_radius: Float[np.ndarray, "r"]
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+
+def pixel_centers(width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    """Centres (x + 0.5, y + 0.5) of all pixels, row by row."""
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+
+
+def rays_from_pixels(camera: Camera, cam_from_world: Rigid3, pixels: Float[np.ndarray, "r 2"]) -> Rays:
+    """One ray through each pixel position (corner convention; distortion undone exactly).
+
+    Pixels at which the distortion has no inverse give nan directions.
+    """
+    bearings = bearings_from_image(camera, pixels)
+    directions = bearings @ cam_from_world.R
+    origin = cam_from_world.target_origin_in_source()
+    # Half a pixel at the focal distance, seen along a ray of length 1 / bearing_z.
+    radius = 0.5 * bearings[:, 2] / np.mean(camera.focal)
+    return Rays(np.broadcast_to(origin, directions.shape).copy(), directions, radius)
+
+
+def rays_from_view(camera: Camera, cam_from_world: Rigid3) -> Rays:
+    """The rays through all pixel centres of a view, row by row."""
+    return rays_from_pixels(camera, cam_from_world, pixel_centers(camera.width, camera.height))

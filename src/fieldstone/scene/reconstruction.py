@@ -1,0 +1,85 @@
+"""Cameras, posed views, points and what connects them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.scene.tracks import Observations
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photo: its file name, the index of its camera, and its pose, None while it is not registered."""
+
+    name: str
+    camera: int
+    cam_from_world: Rigid3 | None
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """World points and their sRGB colours."""
+
+    xyz: Float[np.ndarray, "p 3"]
+    rgb: UInt8[np.ndarray, "p 3"]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Cameras (shared between views by index), views, points, and the observations that tie points to views."""
+
+    cameras: tuple[Camera, ...]
+    views: tuple[View, ...]
+    points: Points
+    observations: Observations
+
+    def __post_init__(self) -> None:
+        for view in self.views:
+            if not 0 <= view.camera < len(self.cameras):
+                raise ValueError(f"view {view.name!r} has camera {view.camera} of {len(self.cameras)}")
+        if len(self.observations) and int(self.observations.point[-1]) >= len(self.points):
+            raise ValueError(f"an observation names point {int(self.observations.point[-1])} of {len(self.points)}")
+
+    def registered(self) -> Int[np.ndarray, "r"]:
+        """Indices of the views that have a pose."""
+        return np.array([i for i, view in enumerate(self.views) if view.cam_from_world is not None], dtype=np.int64)
+
+    def camera_of(self, view: int) -> Camera:
+        """The camera of a view."""
+        return self.cameras[self.views[view].camera]
+
+    def pose_of(self, view: int) -> Rigid3:
+        """`cam_from_world` of a registered view.
+
+        Raises:
+            ValueError: The view is not registered.
+        """
+        pose = self.views[view].cam_from_world
+        if pose is None:
+            raise ValueError(f"view {self.views[view].name!r} is not registered")
+        return pose
+
+    def camera_centers(self) -> Float[np.ndarray, "r 3"]:
+        """Camera positions in the world, of the registered views in their order."""
+        return np.array([self.pose_of(i).target_origin_in_source() for i in self.registered()]).reshape(-1, 3)
+
+    def reprojections(self) -> Float[np.ndarray, "o 2"]:
+        """Pixel at which each observed point appears in its view; nan where it is behind the camera."""
+        out = np.full((len(self.observations), 2), np.nan)
+        for i in self.registered():
+            rows = self.observations.view == i
+            points = self.points.xyz[self.observations.point[rows]]
+            out[rows] = image_from_cam(self.camera_of(i), self.pose_of(i).apply(points))
+        return out
+
+    def reprojection_errors(self) -> Float[np.ndarray, "o"]:
+        """Distance in pixels between each observation and its reprojection; nan behind the camera."""
+        return np.linalg.norm(self.reprojections() - self.observations.pixels, axis=1)

@@ -1,0 +1,1 @@
+"""Estimation on arrays: minimal and linear solvers, RANSAC, least squares, bundle adjustment."""
