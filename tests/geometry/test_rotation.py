@@ -3,6 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fieldstone.geometry import rotation
+from matchers import check_jacobian
 
 EDGE_VECTORS = np.array(
     [[0, 0, 0], [1e-12, 0, 0], [1e-5, -1e-5, 2e-5], [np.pi, 0, 0], [0, -np.pi + 1e-9, 0], [1.0, 2.0, -0.5]]
@@ -53,3 +54,12 @@ def test_angle_between_is_accurate_at_both_ends():
     for angle in (0.0, 1e-9, 1.0, np.pi - 1e-9):
         turned = R @ rotation.exp(np.array([0.6, 0.0, 0.8]) * angle)
         np.testing.assert_allclose(rotation.angle_between(R, turned), angle, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.0099, 0.0101, 1.0, 3.1, np.pi])
+def test_right_jacobian_is_the_derivative_of_exp(seed, angle):
+    axis = np.random.default_rng(seed).normal(size=3)
+    vector = angle * axis / np.linalg.norm(axis)
+    inverse = rotation.exp(-vector)
+    check_jacobian(lambda d: rotation.log(inverse @ rotation.exp(vector + d)), rotation.right_jacobian(vector), size=3)

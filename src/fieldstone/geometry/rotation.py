@@ -55,6 +55,24 @@ def log(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
     return factor * v
 
 
+def right_jacobian(omega: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """J with exp(omega + d) = exp(omega) exp(J d) to first order.
+
+    J = I - (1 - cos a)/a^2 [omega] + (a - sin a)/a^3 [omega]^2, with Taylor series near a = |omega| = 0.
+
+    Source:
+        `chirikjian2011`, section 10.6.
+    """
+    angle2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    b = np.where(small, 0.5 - angle2 / 24.0 + angle2**2 / 720.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
+    c = np.where(small, 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0, (safe - np.sin(safe)) / safe**3)
+    omega_x = skew(omega)
+    return np.eye(3) - b * omega_x + c * (omega_x @ omega_x)
+
+
 def from_wxyz(wxyz: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3 3"]:
     """Rotation of a Hamilton quaternion (w, x, y, z); normalised first.
 
