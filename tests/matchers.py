@@ -32,8 +32,8 @@ def assert_reconstruction_near(
 
     relative_distance: allowed position error, as a share of the extent of the expected camera centres.
     """
-    missing = {expected.views[i].name for i in expected.registered()} - {
-        actual.views[i].name for i in actual.registered()
+    missing = {expected.views[i].name for i in expected.registered().tolist()} - {
+        actual.views[i].name for i in actual.registered().tolist()
     }
     assert not missing, f"not registered: {sorted(missing)}"
     comparison = align(actual, expected)

@@ -69,12 +69,12 @@ class Reconstruction:
 
     def camera_centers(self) -> Float[np.ndarray, "r 3"]:
         """Camera positions in the world, of the registered views in their order."""
-        return np.array([self.pose_of(i).target_origin_in_source() for i in self.registered()]).reshape(-1, 3)
+        return np.array([self.pose_of(i).target_origin_in_source() for i in self.registered().tolist()]).reshape(-1, 3)
 
     def reprojections(self) -> Float[np.ndarray, "o 2"]:
         """Pixel at which each observed point appears in its view; nan where it is behind the camera."""
         out = np.full((len(self.observations), 2), np.nan)
-        for i in self.registered():
+        for i in self.registered().tolist():
             rows = self.observations.view == i
             points = self.points.xyz[self.observations.point[rows]]
             out[rows] = image_from_cam(self.camera_of(i), self.pose_of(i).apply(points))
