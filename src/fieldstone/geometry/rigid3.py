@@ -65,3 +65,19 @@ class Rigid3:
         out[..., :3, 3] = self.t
         out[..., 3, 3] = 1.0
         return out
+
+
+def look_at(center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Rigid3:
+    """`cam_from_world` of a camera at `center` that looks at `target`, with `up` pointing up in its image.
+
+    Raises:
+        ValueError: Centre and target are the same, or the view is along `up`.
+    """
+    forward = target - center
+    right = np.cross(forward, up)
+    if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(up):
+        raise ValueError(f"no view from {center.tolist()} to {target.tolist()} with up {up.tolist()}")
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    return Rigid3(R, -R @ center)
