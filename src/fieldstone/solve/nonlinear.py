@@ -53,9 +53,9 @@ def triangulate_nonlinear(
         trial = np.where(active[:, None], X + step, X)
         trial_cost = _cost_per_point(cameras, camera_of_view, cam_from_world, view, point, pixels, trial, loss)
         better = active & (trial_cost < cost)
-        gain = np.where(better, cost - trial_cost, 0.0)
+        gain = np.where(better, cost, 0.0) - np.where(better, trial_cost, 0.0)
         X[better] = trial[better]
-        active &= ~(better & (gain <= 1e-10 * cost)) & (damping < 1e8)
+        active &= ~(better & (gain <= 1e-10 * np.where(better, cost, 1.0))) & (damping < 1e8)
         cost = np.where(better, trial_cost, cost)
         damping = np.where(better, np.maximum(damping * 0.2, 1e-10), damping * 8.0)
     return X
@@ -118,7 +118,7 @@ def _cost_per_point(
         errors2[rows] = np.nan_to_num(np.sum(difference**2, axis=1), nan=np.inf, posinf=np.inf)
     finite = np.isfinite(errors2)
     rho = np.where(finite, loss(np.where(finite, errors2, 0.0))[0], np.inf)
-    return np.bincount(point, weights=rho, minlength=len(X))
+    return np.bincount(point, weights=rho, minlength=len(X)).astype(np.float64)  # integers where there is none
 
 
 def _normal_equations(
