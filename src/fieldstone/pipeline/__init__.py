@@ -1,0 +1,1 @@
+"""The order of the stages, and where a run keeps what it makes."""
