@@ -1,0 +1,109 @@
+"""What EXIF says about a photo: orientation, focal length in pixels, camera, place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import Image
+from PIL.ExifTags import IFD
+
+FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+"""Of a 35 mm film frame: 43.27 mm."""
+MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+SMALLEST_SENSOR_MM = 4.0
+"""Longer side; cameras with smaller sensors (phones) give the 35 mm equivalent."""
+PLAUSIBLE_FOCAL = (0.1, 20.0)
+"""Range of the focal length, as a share of the longer side, outside which EXIF is taken for wrong."""
+
+MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
+FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
+STORED_WIDTH, STORED_HEIGHT = 0xA002, 0xA003
+FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 0xA20E, 0xA210
+LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
+
+
+@dataclass(frozen=True)
+class Gps:
+    """Place of a photo on WGS 84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None
+
+
+@dataclass(frozen=True)
+class ExifFacts:
+    """What helps to pose a photo; None where EXIF is silent or implausible."""
+
+    focal_px: float | None = None
+    """Focal length prior, in pixels of the photo."""
+    camera: str | None = None
+    """Make and model: photos that share them and their size may share intrinsics."""
+    gps: Gps | None = None
+
+
+def exif_facts(image: Image.Image) -> tuple[int, ExifFacts]:
+    """Orientation (1 to 8; 1 if absent or invalid) of the stored pixels, and the other facts."""
+    # Pillow's own method for PNG decodes the pixels first, in search of EXIF behind them.
+    exif = Image.Image.getexif(image)
+    orientation = exif.get(ORIENTATION, 1)
+    if not isinstance(orientation, int) or not 1 <= orientation <= 8:
+        orientation = 1
+    words = [str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL)]
+    camera = " ".join(word for word in words if word) or None
+    focal = _focal_px(exif.get_ifd(IFD.Exif), *image.size)
+    return orientation, ExifFacts(focal, camera, _gps(exif.get_ifd(IFD.GPSInfo)))
+
+
+def _focal_px(tags: dict[int, Any], width: int, height: int) -> float | None:
+    """Focal length in pixels: 35 mm equivalent by the diagonal, else millimetres times sensor resolution.
+
+    The sensor resolution counts pixels of the photo as the camera stored it: a photo that was made smaller since then
+    keeps the tag, so the share of the stored width that is left scales it. Where the program that made it smaller wrote
+    the new width too, the sensor comes out impossibly small, and the tags say nothing.
+    """
+    diagonal = math.hypot(width, height)
+    equivalent = _number(tags.get(FOCAL_LENGTH_35MM))
+    candidates = [] if equivalent is None else [equivalent / FILM_DIAGONAL_MM * diagonal]
+    focal_mm, resolution = _number(tags.get(FOCAL_LENGTH)), _number(tags.get(FOCAL_PLANE_X))
+    unit = tags.get(FOCAL_PLANE_UNIT, 2)
+    if focal_mm is not None and resolution is not None and unit in MM_PER_RESOLUTION_UNIT:
+        stored = max(_number(tags.get(STORED_WIDTH)) or 0.0, _number(tags.get(STORED_HEIGHT)) or 0.0)
+        stored = stored or max(width, height)
+        pixels_per_mm = resolution / MM_PER_RESOLUTION_UNIT[unit]
+        if stored >= SMALLEST_SENSOR_MM * pixels_per_mm:
+            candidates.append(focal_mm * pixels_per_mm * max(width, height) / stored)
+    low, high = (share * max(width, height) for share in PLAUSIBLE_FOCAL)
+    return next((f for f in candidates if low <= f <= high), None)
+
+
+def _gps(tags: dict[int, Any]) -> Gps | None:
+    """Degrees from (degrees, minutes, seconds) and hemisphere letters."""
+    latitude = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "S", 90.0)
+    longitude = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "W", 180.0)
+    if latitude is None or longitude is None:
+        return None
+    altitude = _number(tags.get(ALTITUDE))
+    below_sea = tags.get(ALTITUDE_REF) in (1, b"\x01")
+    return Gps(latitude, longitude, None if altitude is None else -altitude if below_sea else altitude)
+
+
+def _degrees(parts: Any, hemisphere: Any, negative: str, limit: float) -> float | None:
+    if not isinstance(parts, tuple) or len(parts) != 3:
+        return None
+    numbers = [_number(p) for p in parts]
+    degrees = sum((n or 0.0) / 60**k for k, n in enumerate(numbers))
+    if any(n is None for n in numbers) or degrees > limit:
+        return None
+    return -degrees if str(hemisphere).upper().startswith(negative) else degrees
+
+
+def _number(value: Any) -> float | None:
+    """A finite number that is not negative; rationals with denominator zero are none."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number >= 0 else None

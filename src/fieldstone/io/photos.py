@@ -1,0 +1,228 @@
+"""Photos: decoded upright once, with what their EXIF says about focal length, camera and place."""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+import threading
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from fieldstone.errors import InputError
+from fieldstone.io.atomic import replacing
+from fieldstone.io.exif import ExifFacts, exif_facts
+
+logger = logging.getLogger(__name__)
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
+"""The only decoders that a photo may reach."""
+MAX_MEGAPIXELS = 250.0
+
+UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What turns the stored pixels upright, by EXIF orientation (1: nothing)."""
+
+DAMAGE = (
+    OSError,
+    SyntaxError,  # how the PNG decoder reports a broken chunk
+    ValueError,
+    EOFError,
+    IndexError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    ZeroDivisionError,
+    MemoryError,
+    AttributeError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+"""What Pillow raises on damaged files, found by mutating them."""
+
+_pillow_limits = threading.Lock()
+
+
+@dataclass(frozen=True)
+class PhotoInfo:
+    """What the header says of a photo, without decoding it; width and height are those of the upright photo."""
+
+    path: Path
+    width: int
+    height: int
+    orientation: int
+    """EXIF orientation of the stored pixels, 1 to 8; reading turns them upright."""
+    exif: ExifFacts
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A decoded photo, upright, sRGB. alpha is straight (colours are not multiplied by it), None if opaque."""
+
+    info: PhotoInfo
+    rgb: UInt8[np.ndarray, "h w 3"]
+    alpha: UInt8[np.ndarray, "h w"] | None
+
+
+@dataclass(frozen=True)
+class PhotoProblem:
+    """A file that is no usable photo, and why."""
+
+    path: Path
+    reason: str
+
+
+def natural_key(name: str) -> tuple:
+    """Sort key that counts: `img2` before `img10`; ties are broken by the plain name."""
+    parts = re.split(r"(\d+)", name.casefold())
+    return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts), name
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """The photos of a folder in natural order of their names; hidden files are no photos.
+
+    Raises:
+        InputError: No such folder, or no photo in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder that holds the photos")
+    files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    photos = [p for p in files if p.suffix.lower() in PHOTO_SUFFIXES]
+    unreadable = [p.name for p in files if p.suffix.lower() in UNREADABLE_SUFFIXES]
+    if unreadable:
+        logger.warning("%s: %d files cannot be read, convert them to JPEG: %s", folder, len(unreadable), unreadable[:5])
+    if not photos:
+        reason = "only formats that cannot be read; convert them to JPEG" if unreadable else "no photo"
+        raise InputError(f"{folder}: {reason} (read: {', '.join(PHOTO_SUFFIXES)})")
+    return sorted(photos, key=lambda p: natural_key(p.name))
+
+
+def read_photo_info(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> PhotoInfo:
+    """Size, orientation and EXIF of a photo from its header.
+
+    Raises:
+        InputError: Missing, no photo of a known format, or larger than `max_megapixels`.
+    """
+    with _opened(path, max_megapixels) as (_, info):
+        return info
+
+
+def read_photo(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
+    """Decode a photo and turn it upright. 16-bit channels keep their upper 8 bits; grey becomes RGB.
+
+    Raises:
+        InputError: Missing, damaged, truncated, of an unknown format, or larger than `max_megapixels`.
+    """
+    with _opened(path, max_megapixels) as (image, info):
+        try:
+            image.load()
+            image = _eight_bit(image)
+            if info.orientation in UPRIGHT:
+                image = image.transpose(UPRIGHT[info.orientation])
+            pixels = np.asarray(image)
+        except DAMAGE as error:
+            raise InputError(f"{path}: damaged or truncated photo ({_reason(error)}); copy it again") from error
+    alpha = pixels[:, :, 3].copy() if pixels.shape[2] == 4 else None
+    return Photo(info, np.ascontiguousarray(pixels[:, :, :3]), alpha)
+
+
+def read_photos(
+    paths: Sequence[Path], *, max_megapixels: float = MAX_MEGAPIXELS
+) -> tuple[list[Photo], list[PhotoProblem]]:
+    """Decode photos; those that cannot be read are reported and left out.
+
+    Raises:
+        InputError: Not one of them can be read.
+    """
+    photos: list[Photo] = []
+    problems: list[PhotoProblem] = []
+    for path in paths:
+        try:
+            photos.append(read_photo(path, max_megapixels=max_megapixels))
+        except InputError as error:
+            logger.warning("skipped %s", error)
+            problems.append(PhotoProblem(path, str(error)))
+    if paths and not photos:
+        raise InputError(f"none of {len(paths)} photos can be read; the first: {problems[0].reason}")
+    return photos, problems
+
+
+def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 95) -> None:
+    """Write RGB or RGBA pixels, format by suffix, whole or not at all; `quality` is for JPEG and WebP."""
+    with replacing(path) as temporary:
+        Image.fromarray(rgb).save(temporary, quality=quality)
+
+
+def over_background(
+    rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"] | None, background: float = 1.0
+) -> Float[np.ndarray, "h w 3"]:
+    """Colours in [0, 1], float32, over a grey background (1: white): rgb a + background (1 - a), in sRGB values."""
+    colors = rgb.astype(np.float32) / np.float32(255)
+    if alpha is None:
+        return colors
+    a = alpha[:, :, None].astype(np.float32) / np.float32(255)
+    return colors * a + np.float32(background) * (1 - a)
+
+
+@contextmanager
+def _opened(path: Path, max_megapixels: float) -> Iterator[tuple[Image.Image, PhotoInfo]]:
+    """The image, not yet decoded, and what its header says."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such photo")
+    with path.open("rb") as file:
+        # Pillow's limit on pixels and its warnings about EXIF are process-wide; ours is per call.
+        with _pillow_limits, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                image = Image.open(file, formats=FORMATS)
+                orientation, facts = exif_facts(image)
+            except DAMAGE as error:
+                known = ", ".join(PHOTO_SUFFIXES)
+                raise InputError(f"{path}: not a photo that can be read ({_reason(error)}); read: {known}") from error
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
+        width, height = image.size
+        if width * height > max_megapixels * 1e6:
+            raise InputError(
+                f"{path}: {width} x {height} is more than {max_megapixels:g} megapixels; "
+                "make it smaller, or raise the limit"
+            )
+        if orientation >= 5:
+            width, height = height, width
+        yield image, PhotoInfo(path, width, height, orientation, facts)
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """RGB or RGBA, 8 bits per channel."""
+    if image.mode in ("RGB", "RGBA"):
+        return image
+    if image.mode.startswith("I;16"):
+        image = Image.fromarray((np.asarray(image, dtype=np.uint16) >> 8).astype(np.uint8))
+    elif image.mode in ("I", "F"):
+        raise ValueError("32-bit channels are not supported, convert to 8 or 16 bits")
+    return image.convert("RGBA" if image.has_transparency_data else "RGB")
+
+
+def _reason(error: BaseException) -> str:
+    """One line, without the object addresses that Pillow prints."""
+    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return re.sub(r"<_io\.\w+ name=.*?>", "file", text)

@@ -1,0 +1,221 @@
+"""Photos against arrays of known pixels, EXIF written by Pillow, and damaged files."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD
+from PIL.TiffImagePlugin import IFDRational
+
+from fieldstone.errors import InputError
+from fieldstone.io.photos import (
+    list_photos,
+    natural_key,
+    over_background,
+    read_photo,
+    read_photo_info,
+    read_photos,
+    write_photo,
+)
+from mutations import check_mutations
+from real_data import data_folder
+
+
+def gradient(height: int = 24, width: int = 40) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x * 6, y * 10, (x + y) * 3], axis=2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff", ".PNG"])
+def test_lossless_formats_return_the_pixels(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_photo(path, gradient())
+    photo = read_photo(path)
+    np.testing.assert_array_equal(photo.rgb, gradient())
+    assert photo.alpha is None
+    assert (photo.info.width, photo.info.height) == (40, 24)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+def test_lossy_formats_return_nearly_the_pixels(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_photo(path, gradient())
+    assert np.abs(read_photo(path).rgb.astype(int) - gradient()).mean() < 3
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sixteen_bits_keep_the_upper_eight(tmp_path, suffix, channels):
+    wide = np.random.default_rng(0).integers(0, 2**16, size=(9, 7, channels), dtype=np.uint16)
+    path = tmp_path / f"a{suffix}"
+    assert cv2.imwrite(str(path), wide[:, :, ::-1])
+    np.testing.assert_array_equal(read_photo(path).rgb, np.broadcast_to(wide >> 8, (9, 7, 3)).astype(np.uint8))
+
+
+def test_grey_palette_and_cmyk_become_rgb(tmp_path):
+    grey = gradient()[:, :, 0]
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_photo(tmp_path / "grey.png").rgb, np.repeat(grey[:, :, None], 3, axis=2))
+    Image.fromarray(gradient()).quantize(200).save(tmp_path / "palette.png")
+    assert np.abs(read_photo(tmp_path / "palette.png").rgb.astype(int) - gradient()).mean() < 8
+    Image.fromarray(gradient()).convert("CMYK").save(tmp_path / "cmyk.tif")
+    np.testing.assert_allclose(read_photo(tmp_path / "cmyk.tif").rgb, gradient(), atol=1)
+
+
+def test_alpha_is_straight_and_goes_over_the_background_by_formula(tmp_path):
+    rgba = np.random.default_rng(1).integers(0, 256, size=(5, 6, 4), dtype=np.uint8)
+    write_photo(tmp_path / "a.png", rgba)
+    photo = read_photo(tmp_path / "a.png")
+    assert photo.alpha is not None
+    np.testing.assert_array_equal(photo.rgb, rgba[:, :, :3])
+    np.testing.assert_array_equal(photo.alpha, rgba[:, :, 3])
+    a = rgba[:, :, 3:] / 255
+    expected = rgba[:, :, :3] / 255 * a + (1 - a)
+    np.testing.assert_allclose(over_background(photo.rgb, photo.alpha), expected, atol=1e-6)
+    np.testing.assert_allclose(over_background(photo.rgb, None), rgba[:, :, :3] / 255, atol=1e-7)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied_once_and_recorded(tmp_path, orientation):
+    upright = gradient()
+    # EXIF 2.3, tag 274: where row 0 and column 0 of the stored pixels lie in the upright photo.
+    stored = {
+        1: upright,
+        2: upright[:, ::-1],
+        3: upright[::-1, ::-1],
+        4: upright[::-1],
+        5: upright.transpose(1, 0, 2),
+        6: upright.transpose(1, 0, 2)[::-1],
+        7: upright[::-1, ::-1].transpose(1, 0, 2),
+        8: upright.transpose(1, 0, 2)[:, ::-1],
+    }[orientation]
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.png", exif=exif)
+    photo = read_photo(tmp_path / "a.png")
+    np.testing.assert_array_equal(photo.rgb, upright)
+    assert photo.info.orientation == orientation
+    assert (photo.info.width, photo.info.height) == (40, 24)
+
+
+def save_with_exif(path, **tags):
+    exif = Image.Exif()
+    names = {"f35": 0xA405, "focal": 0x920A, "resolution": 0xA20E, "unit": 0xA210, "stored_width": 0xA002}
+    exif.get_ifd(IFD.Exif).update({names[k]: v for k, v in tags.items() if k in names})
+    exif.get_ifd(IFD.GPSInfo).update(tags.get("gps", {}))
+    exif[0x010F], exif[0x0110] = tags.get("make", "ACME"), "X1\0"
+    Image.fromarray(gradient(300, 400)).save(path, exif=exif)
+    return read_photo_info(path).exif
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"f35": 28}, 28 / np.hypot(36, 24) * 500),
+        ({"focal": IFDRational(5), "resolution": IFDRational(2540), "unit": 2}, 500.0),
+        ({"focal": IFDRational(5), "resolution": IFDRational(1000), "unit": 3}, 500.0),
+        ({"focal": IFDRational(5), "resolution": IFDRational(1000), "unit": 3, "stored_width": 800}, 250.0),
+        ({"focal": IFDRational(5), "resolution": IFDRational(2000), "unit": 3, "stored_width": 400}, None),
+        ({"focal": IFDRational(5)}, None),
+        ({"f35": 0, "focal": IFDRational(5), "resolution": IFDRational(100), "unit": 4}, 500.0),
+        ({"f35": 9999}, None),
+        ({"focal": IFDRational(5, 0), "resolution": IFDRational(1, 0)}, None),
+        ({}, None),
+    ],
+)
+def test_focal_prior_in_pixels(tmp_path, tags, expected):
+    facts = save_with_exif(tmp_path / "a.jpg", **tags)
+    assert facts.focal_px == (None if expected is None else pytest.approx(expected))
+    assert facts.camera == "ACME X1"
+
+
+def test_gps_in_signed_degrees(tmp_path):
+    place = {1: "S", 2: (33.0, 30.0, 36.0), 3: "E", 4: (151.0, 15.0, 0.0), 5: b"\x01", 6: 12.5}
+    gps = save_with_exif(tmp_path / "a.jpg", gps=place).gps
+    assert gps is not None
+    assert gps.latitude_deg == pytest.approx(-33.51)
+    assert gps.longitude_deg == pytest.approx(151.25)
+    assert gps.altitude_m == pytest.approx(-12.5)
+    broken = save_with_exif(tmp_path / "b.jpg", gps=place | {2: (IFDRational(1, 0), 0.0, 0.0)})
+    assert broken.gps is None
+
+
+def test_photos_are_listed_in_natural_order(tmp_path):
+    for name in ["img10.png", "img2.png", "IMG1.JPG", "._img3.png", "notes.txt", "img2b.png"]:
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    assert [p.name for p in list_photos(tmp_path)] == ["IMG1.JPG", "img2.png", "img2b.png", "img10.png"]
+    assert natural_key("a²") < natural_key("b")
+
+
+def test_folders_without_photos_are_refused(tmp_path, caplog):
+    with pytest.raises(InputError, match="no photo"):
+        list_photos(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        list_photos(tmp_path / "missing")
+    (tmp_path / "a.heic").write_bytes(b"")
+    with pytest.raises(InputError, match="convert them to JPEG"):
+        list_photos(tmp_path)
+
+
+def test_one_broken_photo_among_good_ones_is_reported_and_skipped(tmp_path):
+    for k in range(3):
+        write_photo(tmp_path / f"{k}.png", gradient())
+    (tmp_path / "1.png").write_bytes((tmp_path / "1.png").read_bytes()[:-60])
+    photos, problems = read_photos(list_photos(tmp_path))
+    assert [p.info.path.name for p in photos] == ["0.png", "2.png"]
+    assert [p.path.name for p in problems] == ["1.png"]
+    assert "truncated" in problems[0].reason
+    with pytest.raises(InputError, match="none of 1 photos"):
+        read_photos([tmp_path / "1.png"])
+
+
+def test_photos_that_cannot_be_used_say_why(tmp_path):
+    write_photo(tmp_path / "big.png", np.zeros((1000, 1001, 3), dtype=np.uint8))
+    with pytest.raises(InputError, match="1001 x 1000 is more than 1 megapixels"):
+        read_photo(tmp_path / "big.png", max_megapixels=1.0)
+    with pytest.raises(InputError, match="no such photo"):
+        read_photo(tmp_path / "none.png")
+    (tmp_path / "text.jpg").write_text("hello")
+    with pytest.raises(InputError, match="not a photo"):
+        read_photo(tmp_path / "text.jpg")
+    Image.fromarray(np.zeros((4, 4), dtype=np.float32)).save(tmp_path / "float.tif")
+    with pytest.raises(InputError, match="32-bit"):
+        read_photo(tmp_path / "float.tif")
+
+
+def test_header_of_a_huge_image_is_refused_without_decoding(tmp_path):
+    write_photo(tmp_path / "a.png", gradient())
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[16:24] = (65000).to_bytes(4, "big") * 2
+    import zlib
+
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(InputError, match="65000 x 65000 is more than 250 megapixels"):
+        read_photo(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp"])
+def test_damaged_photos_end_in_an_input_error_or_in_pixels(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(IFD.Exif)[0xA405] = 28
+    exif.get_ifd(IFD.GPSInfo).update({1: "N", 2: (1.0, 2.0, 3.0), 3: "E", 4: (1.0, 2.0, 3.0)})
+    Image.fromarray(gradient(60, 80)).save(path, exif=exif)
+
+    def check(photo):
+        assert photo.rgb.shape == (photo.info.height, photo.info.width, 3)
+
+    loaded, refused = check_mutations(path, lambda: read_photo(path), check, count=400)
+    assert min(loaded, refused) > 10
+
+
+def test_real_photos_have_their_known_focal_length():
+    folder = data_folder("lund_door") / "images"
+    info = read_photo_info(list_photos(folder)[0])
+    # The published model of these photos has f = 2435 px; EXIF rounds to whole millimetres.
+    assert info.exif.focal_px == pytest.approx(2435.38, rel=0.1)
