@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fieldstone.geometry.camera import plane_from_image
 from fieldstone.geometry.triangulation import triangulate_tracks_linear
+from fieldstone.mapping.growth import plane_coordinates
 from fieldstone.mapping.record import Drop, StageRecord
 from fieldstone.mapping.working_model import WorkingModel, record_views, reprojections
 from fieldstone.solve.nonlinear import triangulate_nonlinear
@@ -33,7 +33,7 @@ def triangulate_new_points(
     view, pixels = model.tracks.view[rows], model.tracks.pixels[rows]
     poses = model.stacked_poses()
 
-    linear = triangulate_tracks_linear(poses, view, point, _plane_coordinates(model, rows), len(track_ids))
+    linear = triangulate_tracks_linear(poses, view, point, plane_coordinates(model, rows), len(track_ids))
     linear[~np.all(np.isfinite(linear), axis=1)] = np.nan
     model = _with_points(model, track_ids, linear)
     records = record_views(model, names, "linear triangulation", record, is_new)
@@ -86,15 +86,6 @@ def recall_observations(model: WorkingModel, max_error_px: float) -> WorkingMode
     active = model.active.copy()
     active[candidates[result.errors <= max_error_px]] = True
     return replace(model, active=active)
-
-
-def _plane_coordinates(model: WorkingModel, rows: np.ndarray) -> Float[np.ndarray, "u 2"]:
-    """Ideal coordinates on the plane z = 1 of observations."""
-    uv = np.empty((len(rows), 2))
-    for c, camera in enumerate(model.cameras):
-        mine = model.camera_of_view[model.tracks.view[rows]] == c
-        uv[mine] = plane_from_image(camera, model.tracks.pixels[rows[mine]])
-    return uv
 
 
 def _with_points(model: WorkingModel, track_ids: np.ndarray, xyz: Float[np.ndarray, "p 3"]) -> WorkingModel:

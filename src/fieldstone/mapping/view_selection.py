@@ -1,0 +1,43 @@
+"""Which photo to register next: the one that sees many points, spread over its area."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.geometry.camera import Camera
+from fieldstone.mapping.working_model import WorkingModel
+
+LEVELS = 6
+CANDIDATES = 8
+"""Photos with most visible points whose spread is looked at."""
+
+
+def next_views(model: WorkingModel, tried: frozenset[int], min_points: int) -> list[int]:
+    """Unregistered photos that see at least `min_points` points, best first; photos in `tried` are left out.
+
+    Only the photos with most points are ranked by spread, which is what costs time; the others follow in the order
+    of their number of points.
+    """
+    seen = model.visible_points_per_view()
+    waiting = [v for v in range(model.num_views) if model.poses[v] is None and v not in tried and seen[v] >= min_points]
+    waiting.sort(key=lambda v: (-seen[v], v))
+    ranked = [
+        (-spread(model.camera_of(v), model.tracks.pixels[model.observations_of(v)]), v) for v in waiting[:CANDIDATES]
+    ]
+    return [v for _, v in sorted(ranked)] + waiting[CANDIDATES:]
+
+
+def spread(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> int:
+    """Visibility score: on grids of 2 x 2 to 64 x 64 cells, every cell with a point counts the cells of its grid.
+
+    Source:
+        `schonberger2016`, section 4.2.
+    """
+    relative = np.clip(pixels / np.array([camera.width, camera.height]), 0.0, 1.0 - 1e-9)
+    score = 0
+    for level in range(1, LEVELS + 1):
+        cells = 2**level
+        x, y = (relative * cells).astype(np.int64).T
+        score += len(np.unique(x * cells + y)) * cells * cells
+    return score
