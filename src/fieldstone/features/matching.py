@@ -1,20 +1,15 @@
-"""Mutual nearest neighbours with a ratio test: the readable reference of `matching_numba`.
-
-Descriptors are uint8, so squared distances are integers below 2^24: float32 products of 128 terms are exact, and
-every implementation gives the same matches.
-"""
+"""Mutual nearest neighbours with a ratio test."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from fieldstone.features.nearest import TwoNearest
+from fieldstone.features.nearest_numba import two_nearest_numba
 from fieldstone.scene.features import Features
-
-BLOCK = 1024
-"""Rows of the distance matrix that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -47,65 +42,8 @@ def match_mutual(a: Features, b: Features, max_ratio: float) -> Int[np.ndarray, 
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), dtype=np.int64)
-    from_a, from_b = two_nearest(a.descriptors, b.descriptors)
+    from_a, from_b = two_nearest_numba(a.descriptors, b.descriptors)
     return mutual_and_distinct(from_a, from_b, max_ratio)
-
-
-@dataclass(frozen=True, eq=False)
-class TwoNearest:
-    """For each feature of one photo: the nearest of the other, and the squared distances of the nearest two."""
-
-    index: Int[np.ndarray, "n"]
-    nearest: Int[np.ndarray, "n"]
-    second: Int[np.ndarray, "n"]
-    """`NO_SECOND` where the other photo has one feature only."""
-
-    def distinct(self, max_ratio: float) -> Bool[np.ndarray, "n"]:
-        """Whether the nearest is closer than `max_ratio` times the second nearest (1: no test)."""
-        if max_ratio >= 1.0:
-            return np.ones(len(self.index), dtype=bool)
-        return self.nearest < max_ratio**2 * self.second
-
-
-NO_SECOND = 2**24
-"""More than any squared distance of 128 bytes."""
-
-
-def two_nearest(a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"]) -> tuple[TwoNearest, TwoNearest]:
-    """The two nearest neighbours of each row of a in b, and of each row of b in a; lower indices win ties."""
-    return _nearest_rows(a, b), _nearest_rows(b, a)
-
-
-def _nearest_rows(a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"]) -> TwoNearest:
-    blocks = [_two_smallest(squared_distances(a[k : k + BLOCK], b)) for k in range(0, len(a), BLOCK)]
-    index, nearest, second = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    return TwoNearest(index, nearest, second)
-
-
-def squared_distances(a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"]) -> Int[np.ndarray, "n m"]:
-    """|a_i - b_j|^2 = |a_i|^2 + |b_j|^2 - 2 a_i . b_j, exact."""
-    fa, fb = a.astype(np.float32), b.astype(np.float32)
-    dots = (fa @ fb.T).astype(np.int64)
-    return squared_norms(a)[:, None] + squared_norms(b) - 2 * dots
-
-
-def squared_norms(a: UInt8[np.ndarray, "n d"]) -> Int[np.ndarray, "n"]:
-    """|a_i|^2, exact."""
-    return np.einsum("nd,nd->n", a, a, dtype=np.int64)
-
-
-def _two_smallest(
-    distances: Int[np.ndarray, "n m"],
-) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Column of the smallest value of each row (the first of several), and the two smallest values."""
-    rows = np.arange(len(distances))
-    index = np.argmin(distances, axis=1)
-    nearest = distances[rows, index]
-    if distances.shape[1] == 1:
-        return index, nearest, np.full(len(distances), NO_SECOND)
-    rest = distances.copy()
-    rest[rows, index] = NO_SECOND
-    return index, nearest, rest.min(axis=1)
 
 
 def mutual_and_distinct(from_a: TwoNearest, from_b: TwoNearest, max_ratio: float) -> Int[np.ndarray, "m 2"]:
