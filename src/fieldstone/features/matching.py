@@ -47,10 +47,10 @@ def match_mutual(a: Features, b: Features, max_ratio: float) -> Int[np.ndarray, 
 
 
 def mutual_and_distinct(from_a: TwoNearest, from_b: TwoNearest, max_ratio: float) -> Int[np.ndarray, "m 2"]:
-    """Pairs that chose each other and pass the ratio test both ways, by index in a."""
-    i = np.arange(len(from_a.index))
-    j = from_a.index
-    good = (from_b.index[j] == i) & from_a.distinct(max_ratio) & from_b.distinct(max_ratio)[j]
+    """Pairs that chose each other and pass the ratio test both ways, by index in a; index -1 chose nobody."""
+    i = np.flatnonzero(from_a.index >= 0)
+    j = from_a.index[i]
+    good = (from_b.index[j] == i) & from_a.distinct(max_ratio)[i] & from_b.distinct(max_ratio)[j]
     return np.stack([i[good], j[good]], axis=1).astype(np.int64)
 
 

@@ -23,6 +23,7 @@ class TwoNearest:
     """For each feature of one photo: the nearest of the other, and the squared distances of the nearest two."""
 
     index: Int[np.ndarray, "n"]
+    """-1 where no feature of the other photo was allowed."""
     nearest: Int[np.ndarray, "n"]
     second: Int[np.ndarray, "n"]
     """`NO_SECOND` where the other photo has one feature only."""
