@@ -250,7 +250,7 @@ def test_damaged_files_end_in_an_input_error_or_a_sound_graph(tmp_path, name):
             assert np.isfinite(keypoints).all()
 
     loaded, refused = check_mutations(tmp_path / name, lambda: read_matching_txt(tmp_path), check, count=300)
-    assert min(loaded, refused) >= 3
+    assert min(loaded, refused) > 10
 
 
 def test_unity_hall_has_its_known_counts():

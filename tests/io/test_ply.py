@@ -134,7 +134,7 @@ def test_damaged_files_end_in_an_input_error_or_in_points(tmp_path, ascii_text):
         path.write_bytes(header + b"".join(b"%.6f %.6f %.6f\n" % tuple(p) for p in random_points(20).xyz))
     assert len(read_points(path)) == 20
     loaded, refused = check_mutations(path, lambda: read_points(path), lambda p: np.isfinite(p.xyz).all(), count=400)
-    assert min(loaded, refused) >= 3
+    assert min(loaded, refused) > 10
 
 
 def test_vertices_of_a_real_mesh():
