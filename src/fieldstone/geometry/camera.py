@@ -182,7 +182,7 @@ def plane_from_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Float[
         if np.nanmax(length, initial=0.0) < 1e-14:
             break
     distorted, J_uv, _ = camera.spec.distort(uv, camera.coefficients)
-    inverse_exists = np.linalg.det(J_uv) > 0
+    inverse_exists = J_uv[:, 0, 0] * J_uv[:, 1, 1] > J_uv[:, 0, 1] * J_uv[:, 1, 0]
     converged = np.linalg.norm(distorted - target, axis=1) < 1e-9
     return np.where((converged & inverse_exists)[:, None], uv, np.nan)
 
