@@ -12,9 +12,9 @@ from fieldstone.errors import InputError
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """One random damage: truncated, bits flipped, bytes overwritten, a stretch dropped, doubled or zeroed."""
+    """One random damage: truncated, bits flipped, bytes overwritten, dropped, doubled or extreme, digits changed."""
     out = bytearray(data)
-    kind = rng.integers(6)
+    kind = rng.integers(7)
     a, b = sorted(int(i) for i in rng.integers(0, len(data) + 1, size=2))
     b = min(b, a + 64)
     if kind == 0:
@@ -28,9 +28,13 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
         del out[a:b]
     elif kind == 4:
         out[a:a] = out[a:b]
-    else:
+    elif kind == 5:
         # The largest and the smallest values are what counts and sizes are most sensitive to.
         out[a:b] = bytes([int(rng.choice([0, 0xFF, 0x7F]))]) * (b - a)
+    else:
+        digits = [i for i, byte in enumerate(data) if 48 <= byte <= 57] or [0]
+        for i in rng.choice(digits, size=rng.integers(1, 4)):
+            out[i] = b"0123456789-. eN"[rng.integers(15)]
     return bytes(out)
 
 

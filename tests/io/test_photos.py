@@ -13,7 +13,6 @@ from fieldstone.errors import InputError
 from fieldstone.io.photos import (
     list_photos,
     natural_key,
-    over_background,
     read_photo,
     read_photo_info,
     read_photos,
@@ -64,17 +63,13 @@ def test_grey_palette_and_cmyk_become_rgb(tmp_path):
     np.testing.assert_allclose(read_photo(tmp_path / "cmyk.tif").rgb, gradient(), atol=1)
 
 
-def test_alpha_is_straight_and_goes_over_the_background_by_formula(tmp_path):
+def test_alpha_is_kept_straight(tmp_path):
     rgba = np.random.default_rng(1).integers(0, 256, size=(5, 6, 4), dtype=np.uint8)
     write_photo(tmp_path / "a.png", rgba)
     photo = read_photo(tmp_path / "a.png")
-    assert photo.alpha is not None
     np.testing.assert_array_equal(photo.rgb, rgba[:, :, :3])
     np.testing.assert_array_equal(photo.alpha, rgba[:, :, 3])
-    a = rgba[:, :, 3:] / 255
-    expected = rgba[:, :, :3] / 255 * a + (1 - a)
-    np.testing.assert_allclose(over_background(photo.rgb, photo.alpha), expected, atol=1e-6)
-    np.testing.assert_allclose(over_background(photo.rgb, None), rgba[:, :, :3] / 255, atol=1e-7)
+    np.testing.assert_array_equal(photo.pixels, rgba)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

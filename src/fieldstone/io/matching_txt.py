@@ -68,6 +68,11 @@ class _MatchingFile:
     entry_pixels: Float[np.ndarray, "e 2"]
 
 
+def is_course_folder(folder: Path) -> bool:
+    """The folder holds match files, so it is meant to be read by this module."""
+    return folder.is_dir() and any(MATCHING_NAME.fullmatch(p.name) for p in folder.iterdir())
+
+
 def read_matching_txt(folder: Path) -> tuple[MatchGraph, Camera]:
     """The match graph of a course folder and the one camera of its photos; see `read_course_folder`."""
     course = read_course_folder(folder)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from fieldstone.errors import InputError
@@ -80,6 +80,11 @@ class Photo:
     info: PhotoInfo
     rgb: UInt8[np.ndarray, "h w 3"]
     alpha: UInt8[np.ndarray, "h w"] | None
+
+    @property
+    def pixels(self) -> UInt8[np.ndarray, "h w c"]:
+        """RGB, or RGBA where there is alpha."""
+        return self.rgb if self.alpha is None else np.dstack([self.rgb, self.alpha])
 
 
 @dataclass(frozen=True)
@@ -169,17 +174,6 @@ def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 9
     """Write RGB or RGBA pixels, format by suffix, whole or not at all; `quality` is for JPEG and WebP."""
     with replacing(path) as temporary:
         Image.fromarray(rgb).save(temporary, quality=quality)
-
-
-def over_background(
-    rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"] | None, background: float = 1.0
-) -> Float[np.ndarray, "h w 3"]:
-    """Colours in [0, 1], float32, over a grey background (1: white): rgb a + background (1 - a), in sRGB values."""
-    colors = rgb.astype(np.float32) / np.float32(255)
-    if alpha is None:
-        return colors
-    a = alpha[:, :, None].astype(np.float32) / np.float32(255)
-    return colors * a + np.float32(background) * (1 - a)
 
 
 @contextmanager

@@ -86,3 +86,7 @@ class MappingRun:
     """The model before the last round of bundle adjustment."""
     verdicts: dict[str, str]
     """For every photo: registered, or why not."""
+    others: tuple[Reconstruction, ...] = ()
+    """Further components, ranked; they share no photo with the reconstruction."""
+    notes: tuple[str, ...] = ()
+    """Decisions of the mapper that a user should know of, such as the calibration it found."""

@@ -119,12 +119,12 @@ def triangulate_track(R, t, focal, view, uv, max_error2, max_cos, point, inliers
 def _midpoint(origin1, ray1, origin2, ray2, max_cos, out):
     """Midpoint of the shortest segment between two rays; False if they are too parallel or meet behind a camera."""
     cos = ray1[0] * ray2[0] + ray1[1] * ray2[1] + ray1[2] * ray2[2]
-    if cos > max_cos:
+    det = 1.0 - cos * cos
+    if cos > max_cos or det <= 0.0:
         return False
     bx, by, bz = origin2[0] - origin1[0], origin2[1] - origin1[1], origin2[2] - origin1[2]
     along1 = bx * ray1[0] + by * ray1[1] + bz * ray1[2]
     along2 = bx * ray2[0] + by * ray2[1] + bz * ray2[2]
-    det = 1.0 - cos * cos
     s1 = (along1 - cos * along2) / det
     s2 = (cos * along1 - along2) / det
     if s1 <= 0.0 or s2 <= 0.0:

@@ -1,0 +1,145 @@
+"""SIFT keypoints with RootSIFT descriptors, spread over the photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from fieldstone.scene.features import Features
+
+DESCRIPTOR_SCALE = 512.0
+"""RootSIFT descriptors have unit length; as uint8 they are multiplied by this and clipped at 255."""
+
+
+@dataclass(frozen=True)
+class SiftOptions:
+    """What counts as a feature, and how many are kept."""
+
+    max_features: int = 8192
+    max_image_size: int = 1600
+    """Photos whose longer side has more pixels are reduced to this before detection."""
+    contrast_threshold: float = 0.02
+    """Least contrast of a feature, times 3 and relative to the full range of grey levels."""
+    edge_threshold: float = 10.0
+    """Largest ratio of the principal curvatures: larger ones lie along an edge and slide."""
+    cells_per_axis: int = 8
+    """Features compete for their place within the cells of a grid of this many rows and columns."""
+
+    def __post_init__(self) -> None:
+        if self.max_features < 1:
+            raise ValueError(f"max_features must be at least 1, got {self.max_features}")
+        if self.max_image_size < 1:
+            raise ValueError(f"max_image_size must be at least 1 pixel, got {self.max_image_size}")
+        if not 0 < self.contrast_threshold < 1:
+            raise ValueError(f"contrast_threshold must lie in (0, 1), got {self.contrast_threshold}")
+        if self.cells_per_axis < 1:
+            raise ValueError(f"cells_per_axis must be at least 1, got {self.cells_per_axis}")
+
+
+@dataclass(frozen=True)
+class Sift:
+    """Extractor: `Sift(options)(image)` gives the features of a photo, those of the largest scale first.
+
+    One place may give several features, one for each dominant orientation.
+
+    Source:
+        `lowe2004`; the descriptor is that of `arandjelovic2012`, section 3.
+    """
+
+    options: SiftOptions = field(default_factory=SiftOptions)
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
+        """Features of an sRGB photo; keypoints and scales in pixels of the photo as given, corner convention."""
+        reduced = reduce_to(image, self.options.max_image_size)
+        grey = cv2.cvtColor(reduced, cv2.COLOR_RGB2GRAY)
+        detector = cv2.SIFT.create(
+            nfeatures=0,
+            nOctaveLayers=3,
+            contrastThreshold=self.options.contrast_threshold,
+            edgeThreshold=self.options.edge_threshold,
+            sigma=1.6,
+            descriptorType=cv2.CV_8U,
+            # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
+            enable_precise_upscale=True,
+        )
+        keypoints, descriptors = detector.detectAndCompute(grey, None)
+        if descriptors is None:
+            return _no_features()
+        # OpenCV: centre of the first pixel at (0, 0), diameters, degrees.
+        xy = np.array([k.pt for k in keypoints], dtype=np.float64) + 0.5
+        radius = np.array([k.size for k in keypoints], dtype=np.float64) / 2
+        angle = np.deg2rad(np.array([k.angle for k in keypoints], dtype=np.float64))
+        response = np.array([k.response for k in keypoints], dtype=np.float64)
+
+        chosen = spread(xy, response, grey.shape, self.options)
+        order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
+        # Each axis of the photo was reduced by its own, rounded, factor.
+        zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
+        pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
+        return Features(
+            keypoints=pixels,
+            scale=radius[order] * float(np.sqrt(zoom.prod())),
+            angle=angle[order],
+            descriptors=root_sift(descriptors[order]),
+            colors=colors_at(image, pixels),
+        )
+
+
+def reduce_to(image: UInt8[np.ndarray, "h w 3"], max_size: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """The image with its longer side at most `max_size` pixels; never enlarged."""
+    height, width = image.shape[:2]
+    factor = max_size / max(height, width)
+    if factor >= 1.0:
+        return image
+    size = max(round(width * factor), 1), max(round(height * factor), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def spread(
+    xy: Float[np.ndarray, "n 2"], response: Float[np.ndarray, "n"], shape: tuple[int, ...], options: SiftOptions
+) -> Int[np.ndarray, "k"]:
+    """Indices of at most `max_features` features: the strongest of every cell, then the second of every cell, ...
+
+    Features of one place (several orientations) come in by their own strength; no cell with features starves.
+    """
+    if len(xy) <= options.max_features:
+        return np.arange(len(xy))
+    cells = options.cells_per_axis
+    place = np.clip((xy * (cells / np.array([shape[1], shape[0]]))).astype(np.int64), 0, cells - 1)
+    cell = place[:, 1] * cells + place[:, 0]
+    by_cell = np.lexsort((xy[:, 0], xy[:, 1], -response, cell))
+    first_of_cell = np.searchsorted(cell[by_cell], np.arange(cells * cells))
+    rank = np.empty(len(xy), dtype=np.int64)
+    rank[by_cell] = np.arange(len(xy)) - first_of_cell[cell[by_cell]]
+    return np.lexsort((xy[:, 0], xy[:, 1], -response, rank))[: options.max_features]
+
+
+def root_sift(descriptors: UInt8[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:
+    """Square roots of the descriptors' shares, times 512: Euclidean distance then is Hellinger's.
+
+    Source:
+        `arandjelovic2012`, section 3.
+    """
+    values = descriptors.astype(np.float32)
+    shares = values / np.maximum(values.sum(axis=1, keepdims=True), 1.0)
+    return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(shares)), 255.0).astype(np.uint8)
+
+
+def colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colour of the pixel in which each position lies."""
+    column = np.clip(pixels[:, 0].astype(np.int64), 0, image.shape[1] - 1)
+    row = np.clip(pixels[:, 1].astype(np.int64), 0, image.shape[0] - 1)
+    return image[row, column]
+
+
+def _no_features() -> Features:
+    return Features(
+        np.empty((0, 2)),
+        np.empty(0),
+        np.empty(0),
+        np.empty((0, 128), dtype=np.uint8),
+        np.empty((0, 3), dtype=np.uint8),
+    )

@@ -1,0 +1,166 @@
+"""Bundle adjustment of a growing model: of everything, around one view, and until nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.mapping.calibration import CalibrationStep, as_model, priors
+from fieldstone.mapping.growth import covering_tracks, retriangulate
+from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.solve.bundle import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle_problem import BundleProblem
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """When to adjust what, and how exactly."""
+
+    tracks_per_view: int = 600
+    """Points per photo that carry the adjustments while a model grows; the last ones use all."""
+    always_global: int = 16
+    """Up to so many photos every adjustment is of the whole model."""
+    growth: float = 1.15
+    """Beyond, the whole model is adjusted when it has grown by this factor since the last time."""
+    neighbors: int = 8
+    """Photos that are adjusted together with a new one, those that share most points with it."""
+    growing: BundleOptions = field(
+        default_factory=lambda: BundleOptions(
+            loss="soft_l1", max_iterations=10, relative_tolerance=1e-4, keep_gauge=True
+        )
+    )
+    """Adjustments while the model grows."""
+    final: BundleOptions = field(
+        default_factory=lambda: BundleOptions(
+            loss="soft_l1", max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
+        )
+    )
+    """The last adjustments."""
+    min_views_for_intrinsics: int = 3
+    """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
+    max_rounds: int = 4
+    """Rounds of adjustment and triangulation at the end."""
+
+
+Calibration = Sequence[CalibrationStep | None]
+
+
+def adjust(
+    model: WorkingModel,
+    options: RefinementOptions,
+    calibration: Calibration,
+    *,
+    bundle: BundleOptions | None = None,
+    points: Bool[np.ndarray, "t"] | None = None,
+) -> WorkingModel:
+    """All poses, the points that cover them (or those of a mask), and the intrinsics that may move."""
+    points = covering_tracks(model, options.tracks_per_view) if points is None else points
+    return _solve(model, points, model.registered_mask(), calibration, options, bundle or options.growing)
+
+
+def adjust_around(
+    model: WorkingModel, view: int, options: RefinementOptions
+) -> tuple[WorkingModel, Bool[np.ndarray, "t"]]:
+    """A view and the photos that share most points with it, the rest held; also returns the points that moved."""
+    rows = model.used_observations()
+    mine = np.zeros(len(model.xyz), dtype=bool)
+    mine[model.tracks.point[rows[model.tracks.view[rows] == view]]] = True
+    shared = np.bincount(model.tracks.view[rows[mine[model.tracks.point[rows]]]], minlength=model.num_views)
+    shared[view] = shared.max() + 1
+    free = np.zeros(model.num_views, dtype=bool)
+    free[np.argsort(-shared, kind="stable")[: options.neighbors + 1]] = True
+    free &= model.registered_mask() & (shared > 0)
+    touched = np.zeros(len(model.xyz), dtype=bool)
+    touched[model.tracks.point[rows[free[model.tracks.view[rows]]]]] = True
+    points = covering_tracks(model, options.tracks_per_view) & touched
+    fixed: Calibration = (None,) * len(model.cameras)
+    return _solve(model, points, free, fixed, options, options.growing), touched
+
+
+def refine_until_stable(
+    model: WorkingModel,
+    options: RefinementOptions,
+    calibration: Calibration,
+    max_error_px: float,
+    min_angle_deg: float,
+    *,
+    bundle: BundleOptions | None = None,
+    all_points: bool = False,
+) -> WorkingModel:
+    """Rounds of adjustment and of triangulating everything anew, until hardly an observation changes sides."""
+    everything = np.ones(len(model.xyz), dtype=bool)
+    model = retriangulate(model, everything, max_error_px=max_error_px, min_angle_deg=min_angle_deg)
+    for _ in range(options.max_rounds):
+        before = model.used_observations()
+        model = adjust(model, options, calibration, bundle=bundle, points=model.is_point() if all_points else None)
+        model = retriangulate(model, everything, max_error_px=max_error_px, min_angle_deg=min_angle_deg)
+        changed = len(np.setxor1d(before, model.used_observations(), assume_unique=True))
+        if changed < 1e-3 * len(before):
+            break
+    return model
+
+
+def with_calibration(model: WorkingModel, calibration: Calibration) -> WorkingModel:
+    """The model with every camera written in the model that its step refines."""
+    cameras = tuple(
+        camera if step is None else as_model(camera, step.model)
+        for camera, step in zip(model.cameras, calibration, strict=True)
+    )
+    return replace(model, cameras=cameras)
+
+
+def _solve(
+    model: WorkingModel,
+    points: Bool[np.ndarray, "t"],
+    free: Bool[np.ndarray, "v"],
+    calibration: Calibration,
+    options: RefinementOptions,
+    bundle: BundleOptions,
+) -> WorkingModel:
+    """Adjust the free views and the points of a mask; other registered views that see these points hold them."""
+    problem, registered, ids = bundle_problem(model, points, free, calibration, options.min_views_for_intrinsics)
+    result = bundle_adjust(problem, replace(bundle, camera_priors=priors(problem.cameras, calibration)))
+    return model.with_adjusted(result.problem, registered, ids)
+
+
+def bundle_problem(
+    model: WorkingModel,
+    points: Bool[np.ndarray, "t"],
+    free: Bool[np.ndarray, "v"],
+    calibration: Calibration,
+    min_views_for_intrinsics: int,
+) -> tuple[BundleProblem, list[int], Int[np.ndarray, "p"]]:
+    """The problem, and which views and tracks its poses and points are.
+
+    The gauge stays free unless held views fix it: damping keeps the solution near its start.
+    """
+    model = with_calibration(model, calibration)
+    rows = model.used_observations()
+    rows = rows[points[model.tracks.point[rows]]]
+    registered = np.unique(model.tracks.view[rows]).tolist()
+    ids, point = np.unique(model.tracks.point[rows], return_inverse=True)
+    camera_of_view = model.camera_of_view[registered]
+    free_views_of_camera = np.bincount(camera_of_view[free[registered]], minlength=len(model.cameras))
+    refine = tuple(
+        step.mask()
+        if step is not None and free_views_of_camera[c] >= min_views_for_intrinsics
+        else np.zeros(len(camera.params), dtype=bool)
+        for c, (camera, step) in enumerate(zip(model.cameras, calibration, strict=True))
+    )
+    problem = BundleProblem(
+        cameras=model.cameras,
+        camera_of_view=camera_of_view,
+        cam_from_world=Rigid3.stack([model.pose_of(v) for v in registered]),
+        points=model.xyz[ids],
+        view=np.searchsorted(registered, model.tracks.view[rows]),
+        point=point,
+        pixels=model.tracks.pixels[rows],
+        fixed_views=~free[registered],
+        fixed_points=np.zeros(len(ids), dtype=bool),
+        refine=refine,
+    )
+    return problem, registered, ids

@@ -1,0 +1,165 @@
+"""How rich a camera model the photos support: each step up the ladder must predict observations that it never saw."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fieldstone.geometry.camera import image_from_cam
+from fieldstone.mapping.calibration import LADDER, CalibrationStep
+from fieldstone.mapping.growth import covering_tracks, plane_coordinates
+from fieldstone.mapping.refinement import Calibration, RefinementOptions, adjust
+from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.solve.robust_triangulation import triangulate_robust
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SelfCalibrationOptions:
+    """When a richer model is believed."""
+
+    held_out: float = 0.25
+    """Share of the tracks that judge and take no part in the adjustment."""
+    min_gain: float = 0.005
+    """A step must lower the mean squared error of prediction by this share at least."""
+    min_significance: float = 3.0
+    """And by so many standard errors of the mean difference."""
+    max_error_px: float = 4.0
+    """Predictions that are further off count as just this bad."""
+    min_judges: int = 100
+    """With fewer predictions nothing is decided, and the calibration stays as it is."""
+    principal_point: bool = True
+    """Whether steps that move the principal point are on the ladder."""
+
+
+@dataclass(frozen=True)
+class CalibrationTrial:
+    """One step of the ladder against the best before it: mean squared errors of prediction, and the verdict."""
+
+    step: CalibrationStep
+    rms_before_px: float
+    rms_after_px: float
+    significance: float
+    accepted: bool
+
+
+def climb(
+    model: WorkingModel,
+    calibration: Calibration,
+    refinement: RefinementOptions,
+    options: SelfCalibrationOptions,
+    rng: np.random.Generator,
+) -> tuple[tuple[CalibrationStep | None, ...], list[CalibrationTrial]]:
+    """The richest calibration on the ladder that held-out tracks agree to, for all cameras that may be refined.
+
+    Every step is fitted on the other tracks from the best model so far and judged on the same predictions: each
+    observation of a held-out track from the point that its other observations give. The climb ends after two steps in
+    a row that are not believed.
+
+    Returns:
+        The calibration of each camera (None stays None), and every trial.
+    """
+    judges = _held_out(model, options.held_out, rng)
+    rows = model.used_observations()
+    rows = rows[judges[model.tracks.point[rows]]]
+    predictions = _leave_one_out(model.tracks.point[rows])
+    if len(predictions.target) < options.min_judges or all(step is None for step in calibration):
+        return tuple(calibration), []
+    learners = covering_tracks(model, refinement.tracks_per_view) & ~judges
+    best = tuple(calibration)
+    fitted = adjust(model, refinement, best, bundle=refinement.final, points=learners)
+    errors = np.minimum(prediction_errors(fitted, rows, predictions), options.max_error_px) ** 2
+    trials: list[CalibrationTrial] = []
+    refused = 0
+    for step in _steps_above(best, options.principal_point):
+        candidate = tuple(None if old is None else step for old in best)
+        richer = adjust(fitted, refinement, candidate, bundle=refinement.final, points=learners)
+        new_errors = np.minimum(prediction_errors(richer, rows, predictions), options.max_error_px) ** 2
+        gain = errors - new_errors
+        significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
+        accepted = bool(gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance)
+        trials.append(
+            CalibrationTrial(
+                step, float(np.sqrt(errors.mean())), float(np.sqrt(new_errors.mean())), significance, accepted
+            )
+        )
+        logger.info(
+            "calibration %s %s: predicts to %.4f px instead of %.4f px, %.1f standard errors, %s",
+            step.model, "/".join(step.free), np.sqrt(new_errors.mean()), np.sqrt(errors.mean()), significance,
+            "accepted" if accepted else "refused",
+        )  # fmt: skip
+        if accepted:
+            best, fitted, errors, refused = candidate, richer, new_errors, 0
+        else:
+            refused += 1
+            if refused == 2:
+                break
+    return best, trials
+
+
+@dataclass(frozen=True, eq=False)
+class _Predictions:
+    """Prediction k: observation `target[k]` from the observations members[starts[k]:starts[k + 1]] of its track."""
+
+    target: Int[np.ndarray, "k"]
+    members: Int[np.ndarray, "m"]
+    starts: Int[np.ndarray, "k_and_one"]
+
+
+def prediction_errors(
+    model: WorkingModel, rows: Int[np.ndarray, "u"], predictions: _Predictions
+) -> Float[np.ndarray, "k"]:
+    """Distance in pixels of each target to the reprojection of the point that the others of its track give.
+
+    inf where they give none.
+    """
+    uv = plane_coordinates(model, rows)[predictions.members]
+    focal = np.array([model.camera_of(v).focal.mean() for v in range(model.num_views)])
+    points, _ = triangulate_robust(
+        model.stacked_poses(),
+        focal,
+        model.tracks.view[rows[predictions.members]],
+        uv,
+        predictions.starts,
+        max_error_px=1e6,
+        min_angle=1e-4,
+    )
+    target_rows = rows[predictions.target]
+    view = model.tracks.view[target_rows]
+    in_cam = model.stacked_poses()[view].apply(points)
+    out = np.empty(len(view))
+    for c, camera in enumerate(model.cameras):
+        mine = model.camera_of_view[view] == c
+        predicted = image_from_cam(camera, in_cam[mine])
+        out[mine] = np.linalg.norm(predicted - model.tracks.pixels[target_rows[mine]], axis=1)
+    return np.nan_to_num(out, nan=np.inf)
+
+
+def _held_out(model: WorkingModel, share: float, rng: np.random.Generator) -> Bool[np.ndarray, "t"]:
+    """Tracks of at least three used observations, drawn at random."""
+    lengths = np.bincount(model.tracks.point[model.used_observations()], minlength=len(model.xyz))
+    return (rng.random(len(model.xyz)) < share) & (lengths >= 3)
+
+
+def _leave_one_out(point: Int[np.ndarray, "u"]) -> _Predictions:
+    """One prediction for each observation; `point` is sorted."""
+    length = np.bincount(point)[point]
+    first = np.searchsorted(point, point)
+    target = np.repeat(np.arange(len(point)), length)
+    offset = np.arange(len(target)) - np.repeat(np.concatenate([[0], np.cumsum(length)[:-1]]), length)
+    members = first[target] + offset
+    others = members != target
+    return _Predictions(
+        np.arange(len(point)), members[others], np.concatenate([[0], np.cumsum(length - 1)]).astype(np.int64)
+    )
+
+
+def _steps_above(calibration: Sequence[CalibrationStep | None], principal_point: bool) -> list[CalibrationStep]:
+    """The steps of the ladder that are richer than what is refined now."""
+    size = max(len(step.free) for step in calibration if step is not None)
+    return [step for step in LADDER if len(step.free) > size and (principal_point or "cx" not in step.free)]

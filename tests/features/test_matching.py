@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from fieldstone.features.matching import MutualRatio, descriptor_distances, match_mutual
+from fieldstone.features.pairs import exhaustive
+from fieldstone.scene.features import Features
+
+
+def features_of(descriptors: np.ndarray) -> Features:
+    """Features with these descriptors at arbitrary places."""
+    n = len(descriptors)
+    return Features(np.zeros((n, 2)), np.ones(n), np.zeros(n), descriptors, np.zeros((n, 3), dtype=np.uint8))
+
+
+def random_descriptors(n: int, rng: np.random.Generator, high: int = 120) -> np.ndarray:
+    return rng.integers(0, high, size=(n, 128)).astype(np.uint8)
+
+
+def by_loops(a: np.ndarray, b: np.ndarray, max_ratio: float) -> list[tuple[int, int]]:
+    """Mutual nearest neighbours with the ratio test both ways, straight from the definition."""
+
+    def best(row: np.ndarray, others: np.ndarray) -> int | None:
+        squared = [int(((row.astype(int) - other.astype(int)) ** 2).sum()) for other in others]
+        order = sorted(range(len(squared)), key=lambda k: (squared[k], k))
+        if len(order) > 1 and max_ratio < 1 and not squared[order[0]] < max_ratio**2 * squared[order[1]]:
+            return None
+        return order[0]
+
+    forward = [best(row, b) for row in a]
+    backward = [best(row, a) for row in b]
+    return [(i, j) for i, j in enumerate(forward) if j is not None and backward[j] == i]
+
+
+def noisy_copies(n: int, m: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two sets with about half of their rows in common up to noise, some of them twice."""
+    a = random_descriptors(n, rng)
+    b = random_descriptors(m, rng)
+    shared = min(n, m) // 2
+    noise = rng.integers(-9, 10, size=(shared, 128))
+    b[:shared] = np.clip(a[rng.permutation(n)[:shared]].astype(int) + noise, 0, 255)
+    if m > shared + 4:
+        b[shared : shared + 3] = b[:1]
+    return a, b
+
+
+@pytest.mark.parametrize("max_ratio", [0.8, 1.0])
+@pytest.mark.parametrize(("n", "m"), [(40, 50), (1, 1), (1, 9), (9, 1), (3, 2)])
+def test_matches_are_those_of_the_definition(n, m, max_ratio):
+    a, b = noisy_copies(n, m, np.random.default_rng(n + m))
+    matches = match_mutual(features_of(a), features_of(b), max_ratio)
+    assert [tuple(row) for row in matches] == by_loops(a, b, max_ratio)
+
+
+def test_exchanging_the_photos_exchanges_the_columns():
+    a, b = noisy_copies(300, 240, np.random.default_rng(0))
+    forward = match_mutual(features_of(a), features_of(b), 0.8)
+    backward = match_mutual(features_of(b), features_of(a), 0.8)
+    assert len(forward) > 100
+    np.testing.assert_array_equal(forward, backward[np.argsort(backward[:, 1])][:, ::-1])
+
+
+def test_distances_between_matched_descriptors():
+    a = np.array([[255] * 128, [0] * 128, [1] * 128], dtype=np.uint8)
+    matches = np.array([[0, 1], [2, 1]])
+    np.testing.assert_allclose(descriptor_distances(a, a, matches) ** 2, [255**2 * 128, 128])
+
+
+def test_no_features_no_matches():
+    empty, some = features_of(np.empty((0, 128), dtype=np.uint8)), features_of(np.ones((3, 128), dtype=np.uint8))
+    for pair in ((empty, some), (some, empty), (empty, empty)):
+        assert MutualRatio(0.8)(*pair).shape == (0, 2)
+    with pytest.raises(ValueError, match="max_ratio"):
+        MutualRatio(1.5)
+
+
+def test_exhaustive_pairs_leave_out_photos_without_features():
+    empty, some = features_of(np.empty((0, 128), dtype=np.uint8)), features_of(np.ones((3, 128), dtype=np.uint8))
+    assert exhaustive([some, empty, some, some]) == [(0, 2), (0, 3), (2, 3)]
+    assert exhaustive([]) == []

@@ -1,0 +1,129 @@
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduce_to, root_sift, spread
+
+
+def blob(x: float, y: float, sigma: float, width: int = 180, height: int = 160) -> np.ndarray:
+    """A bright Gaussian blob centred at (x, y), corner convention."""
+    column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    grey = 40 + 180 * np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2 * sigma**2))
+    return np.rint(grey).astype(np.uint8)[..., None].repeat(3, axis=2)
+
+
+def texture(seed: int, width: int = 320, height: int = 240) -> np.ndarray:
+    """Noise of several scales and colours."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((height, width, 3), dtype=np.float32)
+    for step in (4, 8, 16, 40):
+        small = rng.normal(size=(height // step + 2, width // step + 2, 3)).astype(np.float32)
+        out += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 40 * out, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.0, 4.0, 8.0])
+def test_a_blob_is_found_where_it_is_at_every_octave(sigma):
+    rng = np.random.default_rng(int(10 * sigma))
+    offsets = []
+    for _ in range(12):
+        x, y = rng.uniform(70, 90, size=2)
+        found = Sift()(blob(x, y, sigma))
+        nearest = np.argmin(np.linalg.norm(found.keypoints - [x, y], axis=1))
+        offsets.append(found.keypoints[nearest] - [x, y])
+        assert 0.7 < found.scale[nearest] / sigma < 1.1
+    # The detector works on 8-bit grey levels: a few hundredths of a pixel of the scale at which it looks.
+    assert np.max(np.abs(np.mean(offsets, axis=0))) < 0.015 * sigma
+    assert np.max(np.abs(offsets)) < 0.05 * sigma
+
+
+def test_reduced_photos_give_keypoints_of_the_full_photo():
+    # 901 x 640 reduces to 500 x 355: both axes round differently.
+    x, y = 431.3, 250.8
+    image = blob(x, y, 9.0, 901, 640)
+    found = Sift(SiftOptions(max_image_size=500))(image)
+    nearest = np.argmin(np.linalg.norm(found.keypoints - [x, y], axis=1))
+    np.testing.assert_allclose(found.keypoints[nearest], [x, y], atol=0.1)
+    assert 0.7 < found.scale[nearest] / 9.0 < 1.1
+    assert reduce_to(image, 500).shape == (355, 500, 3)
+    assert reduce_to(image, 901) is image
+
+
+def test_angles_turn_with_the_photo():
+    image = texture(1, 240, 240)
+    upright, turned = Sift()(image), Sift()(np.ascontiguousarray(np.rot90(image)))
+    # A quarter turn to the left takes (x, y) to (y, 240 - x), and directions (y down) from angle to angle - 90 deg.
+    moved = np.stack([upright.keypoints[:, 1], 240 - upright.keypoints[:, 0]], axis=1)
+    distance = np.linalg.norm(moved[:, None] - turned.keypoints[None], axis=2)
+    turn = np.angle(np.exp(1j * (turned.angle[None] - upright.angle[:, None] + np.pi / 2)))
+    same = (distance < 0.2) & (np.abs(turn) < 0.1)
+    assert np.mean(same.any(axis=1)) > 0.8
+
+
+def test_descriptors_are_square_roots_of_shares():
+    rng = np.random.default_rng(0)
+    raw = rng.integers(0, 160, size=(50, 128)).astype(np.uint8)
+    raw[3] = 0
+    found = root_sift(raw)
+    shares = raw[0] / raw[0].sum()
+    np.testing.assert_array_equal(found[0], np.rint(512 * np.sqrt(shares)))
+    assert not found[3].any()
+    norms = np.linalg.norm(found[[0, 1, 2, 4]].astype(float), axis=1)
+    np.testing.assert_allclose(norms, DESCRIPTOR_SCALE, rtol=2e-3)
+
+
+def test_no_region_starves_and_the_strongest_of_each_cell_stay():
+    rng = np.random.default_rng(2)
+    crowded = rng.uniform([0, 0], [10, 100], size=(900, 2))
+    lonely = rng.uniform([50, 0], [100, 100], size=(60, 2))
+    xy = np.concatenate([crowded, lonely])
+    response = np.concatenate([rng.uniform(1.0, 2.0, 900), rng.uniform(0.0, 0.1, 60)])
+    options = SiftOptions(max_features=300, cells_per_axis=4)
+    kept = spread(xy, response, (100, 100), options)
+    assert len(kept) == len(set(kept.tolist())) == 300
+    assert set(range(900, 960)) <= set(kept.tolist())
+    for cell in range(4):
+        members = np.flatnonzero((xy[:, 0] < 25) & (xy[:, 1] // 25 == cell))
+        chosen = np.intersect1d(kept, members)
+        left = np.setdiff1d(members, chosen)
+        assert response[chosen].min() > response[left].max()
+
+
+def test_features_are_the_same_every_time_largest_first_and_survive_pickling():
+    image = texture(3)
+    threads = cv2.getNumThreads()
+    extractor = pickle.loads(pickle.dumps(Sift(SiftOptions(max_features=200))))  # noqa: S301
+    try:
+        cv2.setNumThreads(1)
+        one = extractor(image)
+        cv2.setNumThreads(2)
+        two = extractor(image)
+    finally:
+        cv2.setNumThreads(threads)
+    assert len(one) == 200
+    for name in ("keypoints", "scale", "angle", "descriptors", "colors"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert np.all(np.diff(one.scale) <= 0)
+    inside = one.keypoints.astype(int)
+    np.testing.assert_array_equal(one.colors, image[inside[:, 1], inside[:, 0]])
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (40, 3), (64, 64)])
+def test_a_photo_without_texture_has_no_features(shape):
+    found = Sift()(np.full((*shape, 3), 77, dtype=np.uint8))
+    assert len(found) == 0
+    assert found.descriptors.shape == (0, 128)
+    assert found.descriptors.dtype == np.uint8
+
+
+def test_options_refuse_nonsense():
+    for wrong in (
+        lambda: SiftOptions(max_features=0),
+        lambda: SiftOptions(max_image_size=0),
+        lambda: SiftOptions(contrast_threshold=0.0),
+        lambda: SiftOptions(cells_per_axis=0),
+    ):
+        with pytest.raises(ValueError):
+            wrong()

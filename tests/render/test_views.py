@@ -1,0 +1,45 @@
+import numpy as np
+
+from fieldstone.field.radiance_field import RenderedRays
+from fieldstone.geometry import rotation
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.render import views
+from fieldstone.render.views import render_view
+
+
+def render_ball(rays):
+    """An opaque ball of radius 1 at the origin, coloured by its normal."""
+    b = np.sum(rays.origins * rays.directions, axis=1)
+    discriminant = b**2 - np.sum(rays.origins**2, axis=1) + 1
+    t = -b - np.sqrt(np.maximum(discriminant, 0))
+    hit = (discriminant > 0) & (t > 0)
+    normals = rays.origins + t[:, None] * rays.directions
+    return RenderedRays(np.where(hit[:, None], 0.5 + 0.5 * normals, 0.0), np.where(hit, t, 9.0), hit.astype(float))
+
+
+def test_view_of_a_ball(monkeypatch):
+    monkeypatch.setattr(views, "RAYS_AT_ONCE", 37)
+    camera = Camera("PINHOLE", 40, 30, np.array([35.0, 35.0, 19.0, 14.0]))
+    pose = Rigid3(rotation.exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, -0.1, 4.0]))
+    view = render_view(render_ball, camera, pose)
+    assert view.rgb.shape == (30, 40, 3)
+    # The centre of the ball is seen where the camera projects it, and its outline is the expected ellipse.
+    row, column = np.nonzero(view.opacity)
+    center = image_from_cam(camera, pose.t[None])[0]
+    np.testing.assert_allclose([column.mean() + 0.5, row.mean() + 0.5], center, atol=0.3)
+    # The cone around the ball: half angle asin(1 / distance), of area pi f^2 tan^2 a near the optical axis.
+    distance = np.linalg.norm(pose.t)
+    area = np.pi * 35**2 / (distance**2 - 1)
+    assert abs(len(row) / area - 1) < 0.03
+    nearest = view.depth[view.opacity > 0].min()
+    assert distance - 1 <= nearest < distance - 1 + 0.01
+
+
+def test_pixels_outside_of_the_lens_are_empty():
+    camera = Camera("SIMPLE_RADIAL", 6, 4, np.array([5.0, 3.0, 2.0, -1.0]))
+    view = render_view(render_ball, camera, Rigid3(np.eye(3), np.array([0.0, 0, 1.5])))
+    assert view.opacity[0, 0] == 0
+    assert view.depth[0, 0] == 0
+    assert view.opacity[2, 3] == 1
+    assert np.all(np.isfinite(view.rgb))
