@@ -1,0 +1,69 @@
+"""Matches to two-view geometry: every pair verified on its own, in parallel, with the same result in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fieldstone.geometry.camera import Camera
+from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
+from fieldstone.solve.focal_voting import FocalVote, vote_focal
+from fieldstone.solve.linear_two_view import FundamentalEstimator
+from fieldstone.solve.ransac import RansacOptions, ransac
+from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
+
+MAX_VOTING_PAIRS = 300
+
+
+def verify_pairs(
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: TwoViewOptions,
+    seed: int,
+    threads: int,
+) -> MatchGraph:
+    """The graph with the geometry and inliers of every pair, for cameras whose focal length is known well enough.
+
+    The kernels release the interpreter lock, so threads run side by side. The random numbers of pair (i, j) depend on
+    the seed, i and j alone.
+    """
+    pairs = sorted(graph.matches)
+
+    def verify(pair: ImagePair) -> TwoView:
+        camera1, camera2 = (cameras[camera_of_image[k]] for k in pair)
+        pixels1, pixels2 = graph.matched_pixels(pair)
+        return estimate_two_view(camera1, camera2, pixels1, pixels2, options, np.random.default_rng([seed, *pair]))
+
+    with ThreadPoolExecutor(threads) as pool:
+        return graph.with_two_views(dict(zip(pairs, pool.map(verify, pairs), strict=True)))
+
+
+def calibrate_from_pairs(
+    graph: MatchGraph, camera: Camera, images: Bool[np.ndarray, "n"], options: TwoViewOptions, seed: int, threads: int
+) -> FocalVote | None:
+    """A vote on the unknown focal length that some photos share, over the pairs among them.
+
+    Returns:
+        The focal length over the longer side of the photo; None if no pair has a fundamental matrix.
+    """
+    pairs = [pair for pair in sorted(graph.matches) if images[pair[0]] and images[pair[1]]]
+    pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:MAX_VOTING_PAIRS]
+    center, unit = camera.principal_point, float(max(camera.width, camera.height))
+
+    def fundamental(pair: ImagePair) -> tuple[Float[np.ndarray, "3 3"], int] | None:
+        pixels1, pixels2 = ((p - center) / unit for p in graph.matched_pixels(pair))
+        ransac_options = RansacOptions(max_error_px=options.ransac.max_error_px / unit, max_trials=2000)
+        found = ransac(FundamentalEstimator(pixels1, pixels2), ransac_options, np.random.default_rng([seed, *pair]))
+        if found is None or found.inliers.sum() < options.min_inliers:
+            return None
+        return found.model, int(found.inliers.sum())
+
+    with ThreadPoolExecutor(threads) as pool:
+        found = [result for result in pool.map(fundamental, pairs) if result is not None]
+    if not found:
+        return None
+    return vote_focal(np.array([F for F, _ in found]), np.array([float(n) for _, n in found]))

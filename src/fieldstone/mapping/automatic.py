@@ -1,0 +1,138 @@
+"""From a verified match graph to finished models, with nothing that has to be set by hand."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from fieldstone.geometry.camera import Camera
+from fieldstone.mapping.calibration import CalibrationStep, as_model
+from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, map_incremental
+from fieldstone.mapping.point_update import drop_outliers
+from fieldstone.mapping.record import Drop, MappingRun, StageRecord
+from fieldstone.mapping.refinement import adjust, refine_until_stable
+from fieldstone.mapping.registration import verdict_of_pairs
+from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
+from fieldstone.mapping.textbook import four_poses
+from fieldstone.mapping.working_model import WorkingModel, record_views, to_reconstruction
+from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.tracks import Observations
+
+logger = logging.getLogger(__name__)
+
+STARTING_STEP = CalibrationStep("SIMPLE_RADIAL", ("f", "k"))
+
+
+@dataclass(frozen=True)
+class AutomaticOptions:
+    """Growing, self-calibration and the last adjustment."""
+
+    incremental: IncrementalOptions = field(default_factory=IncrementalOptions)
+    self_calibration: SelfCalibrationOptions = field(default_factory=SelfCalibrationOptions)
+    min_angle_deg: float = 1.5
+    """Points of the result have two rays that meet at this angle at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """One component after its last adjustment."""
+
+    model: WorkingModel
+    before: WorkingModel
+    drops: list[Drop]
+    trials: list[CalibrationTrial]
+
+
+def map_automatic(
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    known: Bool[np.ndarray, "c"],
+    options: AutomaticOptions,
+    seed: int,
+) -> MappingRun:
+    """Models of all components; the one with most photos is the reconstruction, the others are kept beside it.
+
+    Args:
+        graph: Verified, see `features.verification`.
+        known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
+    """
+    calibration = [None if known[c] else STARTING_STEP for c in range(len(cameras))]
+    start_cameras = [camera if known[c] else as_model(camera, STARTING_STEP.model) for c, camera in enumerate(cameras)]
+    grown = map_incremental(graph, start_cameras, camera_of_image, calibration, options.incremental, seed)
+    if not grown:
+        verdicts = {name: f"not registered: {verdict_of_pairs(graph, v)}" for v, name in enumerate(graph.names)}
+        nothing = WorkingModel.start(tuple(cameras), camera_of_image, Observations.empty())
+        return MappingRun(to_reconstruction(nothing, graph), graph, None, (), (), None, verdicts)
+    finished = [finish(component, options, np.random.default_rng([seed, k])) for k, component in enumerate(grown)]
+    best = finished[0]
+    records: list[StageRecord] = record_views(best.before, graph.names, "before BA")
+    records += record_views(best.model, graph.names, "after BA")
+    start = grown[0].start.pair
+    initial = four_poses(graph, start, start_cameras, camera_of_image)
+    return MappingRun(
+        to_reconstruction(best.model, graph),
+        graph,
+        initial,
+        tuple(records),
+        tuple(best.drops),
+        to_reconstruction(best.before, graph),
+        _verdicts(graph, grown, [f.model for f in finished]),
+        tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
+        tuple(_describe(trial) for trial in best.trials) + tuple(_describe_camera(c) for c in best.model.cameras),
+    )
+
+
+def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generator) -> Finished:
+    """Self-calibration, then adjustment of everything with everything."""
+    incremental, refinement = options.incremental, options.incremental.refinement
+    before = grown.model
+    calibration, trials = climb(grown.model, grown.calibration, refinement, options.self_calibration, rng)
+    model = refine_until_stable(
+        grown.model,
+        refinement,
+        calibration,
+        incremental.max_error_px,
+        options.min_angle_deg,
+        bundle=refinement.final,
+        all_points=True,
+    )
+    model, drops = drop_outliers(model, "end", incremental.max_error_px, options.min_angle_deg)
+    model = adjust(model, refinement, calibration, bundle=refinement.final, points=model.is_point())
+    model, more = drop_outliers(model, "last adjustment", incremental.max_error_px, options.min_angle_deg)
+    return Finished(model, before, drops + more, trials)
+
+
+def _verdicts(graph: MatchGraph, grown: list[GrownModel], models: list[WorkingModel]) -> dict[str, str]:
+    """For every photo: in which model with how many points, or why in none."""
+    out = {}
+    for view, name in enumerate(graph.names):
+        home = next((k for k, model in enumerate(models) if model.poses[view] is not None), None)
+        if home is None:
+            tried = [g.failures[view] for g in grown if view in g.failures]
+            out[name] = f"not registered: {'; '.join([*tried[:1], verdict_of_pairs(graph, view)])}"
+        elif home == 0:
+            out[name] = f"registered: {len(models[0].observations_of(view))} points; {grown[0].reasons[view]}"
+        else:
+            out[name] = f"in a model of its own ({home + 1} of {len(models)}): {verdict_of_pairs(graph, view)}"
+    return out
+
+
+def _describe(trial: CalibrationTrial) -> str:
+    """One line on one step of the ladder."""
+    verdict = "accepted" if trial.accepted else "refused"
+    return (
+        f"calibration {trial.step.model} with {', '.join(trial.step.free)} free: held-out observations predicted to "
+        f"{trial.rms_after_px:.4f} px instead of {trial.rms_before_px:.4f} px "
+        f"({trial.significance:+.1f} standard errors), {verdict}"
+    )
+
+
+def _describe_camera(camera: Camera) -> str:
+    """One line on the intrinsics that a model ended with."""
+    values = ", ".join(f"{n} {v:.6g}" for n, v in zip(camera.spec.param_names, camera.params, strict=True))
+    return f"camera {camera.model}: {values}"

@@ -1,0 +1,195 @@
+"""The incremental mapper: from the best pair, photo by photo, to every component that the matches hold together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.mapping.calibration import CalibrationStep
+from fieldstone.mapping.growth import retriangulate, tracks_of_view
+from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
+from fieldstone.mapping.registration import Start, rank_starts, register_view
+from fieldstone.mapping.view_selection import next_views
+from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.tracks import build_tracks
+from fieldstone.solve.ransac import RansacOptions
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Thresholds of one rung of the retry ladder; the first is strict, the later ones relax."""
+
+    min_start_angle_deg: float
+    min_start_points: int
+    min_inliers: int
+    min_angle_deg: float
+    """Points whose rays meet at a smaller angle are no points."""
+
+
+LADDER = (
+    Stage(min_start_angle_deg=8.0, min_start_points=100, min_inliers=30, min_angle_deg=1.5),
+    Stage(min_start_angle_deg=4.0, min_start_points=50, min_inliers=20, min_angle_deg=1.0),
+    Stage(min_start_angle_deg=1.5, min_start_points=25, min_inliers=12, min_angle_deg=0.5),
+)
+
+
+@dataclass(frozen=True)
+class IncrementalOptions:
+    """How a model grows."""
+
+    max_error_px: float = 4.0
+    """Observations with a larger reprojection error are no inliers of their point; pixels of the matched photos."""
+    pnp: RansacOptions = field(default_factory=lambda: RansacOptions(max_error_px=8.0))
+    """Registration of a photo."""
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
+    """Bundle adjustment while growing and at the end."""
+    min_model_size: int = 2
+    """Smallest component that is kept."""
+    max_starts: int = 8
+    """Pairs tried as the start of one component, at each rung of the ladder."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrownModel:
+    """One component, the rung of the ladder that each photo needed, and the calibration it ended with."""
+
+    model: WorkingModel
+    start: Start
+    reasons: dict[int, str]
+    """Per registered photo, the numbers of its registration."""
+    failures: dict[int, str]
+    """Per photo that was tried and not registered, the numbers of its last attempt."""
+    calibration: tuple[CalibrationStep | None, ...]
+
+
+def map_incremental(
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    calibration: Sequence[CalibrationStep | None],
+    options: IncrementalOptions,
+    seed: int,
+) -> list[GrownModel]:
+    """Every component of the graph that grows from a pair, the one with most photos first.
+
+    Args:
+        graph: Verified: `two_views` hold the geometry and inliers of every pair.
+        calibration: Per camera, what may be refined from the start; None keeps its intrinsics as they are.
+
+    Returns:
+        Models that share no photo, before the final refinement; empty if no pair gives a start.
+    """
+    tracks, _ = build_tracks(graph, split_conflicts=True)
+    empty = WorkingModel.start(tuple(cameras), camera_of_image, tracks)
+    free = np.ones(graph.num_images, dtype=bool)
+    grown: list[GrownModel] = []
+    for stage in LADDER:
+        while free.sum() >= options.min_model_size:
+            model = _grow_one(graph, empty, free, tuple(calibration), stage, options, seed)
+            if model is None:
+                break
+            grown.append(model)
+            free = free & ~model.model.registered_mask()
+            logger.info("component of %d photos", model.model.registered_mask().sum())
+        if grown:
+            break  # what a strict start left over is retried from the model itself, not by a weak start of its own
+    return sorted(grown, key=lambda g: -int(g.model.registered_mask().sum()))
+
+
+def _grow_one(
+    graph: MatchGraph,
+    empty: WorkingModel,
+    free: Bool[np.ndarray, "n"],
+    calibration: tuple[CalibrationStep | None, ...],
+    stage: Stage,
+    options: IncrementalOptions,
+    seed: int,
+) -> GrownModel | None:
+    """The model of the first start that grows beyond its pair; failing that, the best pair that is stable."""
+    fallback = None
+    starts = rank_starts(graph, empty, free, stage.min_start_angle_deg, stage.min_start_points)
+    for start in starts[: options.max_starts]:
+        model = start_model(empty, start, stage, options)
+        if model is None:
+            continue
+        grown = grow(model, start, free, calibration, options, seed)
+        if grown.model.registered_mask().sum() > 2 or free.sum() == 2:
+            return grown
+        fallback = fallback or grown
+    return fallback
+
+
+def start_model(empty: WorkingModel, start: Start, stage: Stage, options: IncrementalOptions) -> WorkingModel | None:
+    """Two posed views and their points after bundle adjustment; None if too few points remain."""
+    i, j = start.pair
+    model = empty.with_pose(i, Rigid3.identity()).with_pose(j, start.cam2_from_cam1)
+    everything = np.ones(len(model.xyz), dtype=bool)
+    for _ in range(2):
+        model = retriangulate(model, everything, max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg)
+        if model.is_point().sum() < stage.min_start_points // 2:
+            return None
+        model = adjust(model, options.refinement, (None,) * len(model.cameras))
+    return retriangulate(model, everything, max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg)
+
+
+def grow(
+    model: WorkingModel,
+    start: Start,
+    free: Bool[np.ndarray, "n"],
+    calibration: tuple[CalibrationStep | None, ...],
+    options: IncrementalOptions,
+    seed: int,
+) -> GrownModel:
+    """Register photo after photo until none of the free ones fits, relaxing the thresholds step by step.
+
+    Every registration is followed by a bundle adjustment: of everything while the model is small or has grown by a
+    share, of the photo and its neighbours otherwise.
+    """
+    reasons = dict.fromkeys(start.pair, f"start of the model: {start.num_points} points")
+    failures: dict[int, str] = {}
+    blocked = frozenset(np.flatnonzero(~free).tolist())
+    last_global = 2
+    for rung, stage in enumerate(LADDER):
+        tried: frozenset[int] = frozenset()
+        while candidates := next_views(model, tried | blocked, stage.min_inliers):
+            view = candidates[0]
+            rng = np.random.default_rng([seed, view, int(model.registered_mask().sum()), rung])
+            result = register_view(model, view, options.pnp, stage.min_inliers, rng)
+            if result.cam_from_world is None:
+                tried |= {view}
+                failures[view] = result.reason()
+                continue
+            logger.info("registered view %d: %s", view, result.reason())
+            reasons[view] = result.reason()
+            failures.pop(view, None)
+            model = model.with_pose(view, result.cam_from_world)
+            model = retriangulate(
+                model, tracks_of_view(model, view), max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg
+            )
+            size = int(model.registered_mask().sum())
+            if size <= options.refinement.always_global or size >= options.refinement.growth * last_global:
+                model = adjust(model, options.refinement, calibration)
+                touched, last_global = np.ones(len(model.xyz), dtype=bool), size
+                tried = frozenset()  # a better model may take what a worse one could not
+            else:
+                model, touched = adjust_around(model, view, options.refinement)
+            model = retriangulate(model, touched, max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg)
+        everyone = model.registered_mask() | ~free
+        if everyone.all():
+            break
+        model = refine_until_stable(model, options.refinement, calibration, options.max_error_px, stage.min_angle_deg)
+    return GrownModel(model, start, reasons, failures, calibration)
+
+
+def with_model(grown: GrownModel, model: WorkingModel) -> GrownModel:
+    """The same story with a refined model."""
+    return replace(grown, model=model)

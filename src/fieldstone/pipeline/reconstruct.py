@@ -1,0 +1,172 @@
+"""Photos, or the course's match files, to camera poses, a point cloud and an honest error table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fieldstone import __version__
+from fieldstone.io.atomic import write_json
+from fieldstone.io.colmap import write_colmap
+from fieldstone.io.matching_txt import is_course_folder
+from fieldstone.io.ply import write_points
+from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.record import MappingRun, StageRecord
+from fieldstone.mapping.textbook import TextbookOptions, map_textbook
+from fieldstone.pipeline.material import MatchingOptions, Material, OnStage, match_photos, read_course
+from fieldstone.report.figure_store import write_figures
+from fieldstone.report.figures import mapping_figures, thumbnails
+from fieldstone.report.summary import write_report
+from fieldstone.scene.reconstruction import Reconstruction
+
+Mapper = Literal["auto", "textbook", "incremental"]
+
+HOW_ERRORS_ARE_COUNTED = (
+    "Every error is the distance in pixels between an observed keypoint and the reprojection of its point, taken over "
+    "all observations that the stage used; a point behind its camera has no reprojection and is counted in its own "
+    "column. Mean, median and RMS are over observations, not over points. 'PnP RANSAC' and 'non-linear PnP' count the "
+    "inliers of the RANSAC, 'linear PnP' all correspondences. After bundle adjustment, observations over the "
+    "threshold have been dropped: the table of drops says how many, where and why."
+)
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """How a folder becomes a model."""
+
+    mapper: Mapper = "auto"
+    """auto: textbook for given matches, incremental for photos."""
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    """Features, matches and two-view geometry of photos."""
+    textbook: TextbookOptions = field(default_factory=TextbookOptions)
+    incremental: AutomaticOptions = field(default_factory=AutomaticOptions)
+    seed: int = 0
+    """Every random number of the run follows from it."""
+
+
+def reconstruct(
+    source: Path, out: Path, options: ReconstructOptions, *, on_stage: OnStage = lambda stage: None
+) -> dict[str, Any]:
+    """Reconstruct a folder of photos, or one in the course format, and write everything to `out`.
+
+    Writes `sparse/0/` (COLMAP binary; further components in `sparse/1/` and so on), `points.ply`, `figures/`,
+    `run.json` and `report.html`.
+
+    Returns:
+        What `run.json` holds.
+
+    Raises:
+        InputError: The folder is no usable input.
+    """
+    course = is_course_folder(source)
+    mapper = options.mapper if options.mapper != "auto" else "textbook" if course else "incremental"
+    material = read_course(source) if course else match_photos(source, options.matching, options.seed, on_stage)
+    on_stage("mapping")
+    start = time.perf_counter()
+    run = full_size(run_mapper(mapper, material, options), material)
+    seconds = {**material.seconds, "mapping": time.perf_counter() - start}
+    on_stage("writing")
+    start = time.perf_counter()
+    for k, model in enumerate((run.reconstruction, *run.others)):
+        if len(model.registered()):
+            write_colmap(model, out / "sparse" / str(k))
+    if len(run.reconstruction.points):
+        write_points(run.reconstruction.points, out / "points.ply")
+    small = thumbnails(run.graph.names, material.photos.get)
+    write_figures(out / "figures", "mapping", mapping_figures(run, material.photos.get), small)
+    seconds["writing"] = time.perf_counter() - start
+    record = run_record(source, mapper, run, material, options.seed, seconds)
+    write_json(out / "run.json", record)
+    write_report(out)
+    return record
+
+
+def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) -> MappingRun:
+    """One of the two mappers on the same material."""
+    graph, cameras, camera_of_image = material.graph, material.cameras, material.camera_of_image
+    if mapper == "textbook":
+        textbook = replace(options.textbook, refine_focal=not material.known.all())
+        return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
+    return map_automatic(graph, cameras, camera_of_image, material.known, options.incremental, options.seed)
+
+
+def full_size(run: MappingRun, material: Material) -> MappingRun:
+    """The run in the pixels of the photos: models, matches and records."""
+    factor = material.pixel_factors()
+    model = material.full_size(run.reconstruction)
+    camera_of_image = np.array([view.camera for view in model.views], dtype=np.int64)
+    scale = factor[camera_of_image]
+
+    def scaled(record: StageRecord) -> StageRecord:
+        by = scale[record.view]
+        return replace(record, pixels=record.pixels * by, reprojected=record.reprojected * by)
+
+    graph = replace(run.graph, keypoints=tuple(k * s for k, s in zip(run.graph.keypoints, scale, strict=True)))
+    return replace(
+        run,
+        reconstruction=model,
+        graph=graph,
+        records=tuple(scaled(record) for record in run.records),
+        before_bundle=None if run.before_bundle is None else material.full_size(run.before_bundle),
+        others=tuple(material.full_size(other) for other in run.others),
+    )
+
+
+def run_record(
+    source: Path, mapper: str, run: MappingRun, material: Material, seed: int, seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """What `run.json` tells of a run."""
+    model = run.reconstruction
+    counts = np.bincount(model.observations.view, minlength=len(model.views))
+    photos = [
+        {
+            "name": view.name,
+            "registered": view.cam_from_world is not None,
+            "verdict": run.verdicts[view.name],
+            "points": int(counts[k]),
+        }
+        for k, view in enumerate(model.views)
+    ]
+    photos += [
+        {"name": p.path.name, "registered": False, "verdict": f"not readable: {p.reason}", "points": 0}
+        for p in material.problems
+        if p.path.name not in run.verdicts
+    ]
+    return {
+        "version": __version__,
+        "input": source.resolve().name,
+        "mapper": mapper,
+        "seed": seed,
+        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
+        "summary": summary(model, len(photos)),
+        "components": [len(m.registered()) for m in (model, *run.others)],
+        "cameras": [
+            {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in model.cameras
+        ],
+        "notes": list(run.notes),
+        "photos": photos,
+        "table": [record.as_row() for record in run.records],
+        "drops": [asdict(drop) for drop in run.drops],
+        "how_errors_are_counted": HOW_ERRORS_ARE_COUNTED,
+    }
+
+
+def summary(model: Reconstruction, num_photos: int) -> dict[str, Any]:
+    """The numbers of a model that one looks at first."""
+    errors = model.reprojection_errors()
+    some = len(errors) > 0
+    return {
+        "registered": len(model.registered()),
+        "photos": num_photos,
+        "points": len(model.points),
+        "observations": len(model.observations),
+        "mean_px": float(errors.mean()) if some else None,
+        "median_px": float(np.median(errors)) if some else None,
+        "rms_px": float(np.sqrt(np.mean(errors**2))) if some else None,
+        "mean_track_length": len(errors) / len(model.points) if some else None,
+    }

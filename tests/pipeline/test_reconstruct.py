@@ -1,0 +1,148 @@
+"""From folders to models through the command line, on given matches and on photos."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fieldstone.cli import main
+from fieldstone.io.colmap import read_colmap
+from fieldstone.scene.reconstruction import Reconstruction
+from fieldstone.synthetic.scenes import SceneOptions, synthesize
+from matchers import assert_reconstruction_near
+from real_data import data_folder
+
+
+def write_course_folder(folder: Path, *, matlab: bool = False, seed: int = 0) -> Reconstruction:
+    """A synthetic scene in the course format, without photos; returns the truth."""
+    options = SceneOptions(num_cameras=4, num_points=150, layout="arc", noise_px=0.3, outlier_share=0.1)
+    scene = synthesize(options, np.random.default_rng(seed))
+    graph, K = scene.graph, scene.truth.cameras[0].calibration_matrix()
+    K[:2, 2] -= 0.5
+    rows = [" ".join(repr(float(x)) for x in row) for row in K]
+    folder.mkdir(parents=True)
+    text = f"K = [{'; '.join(rows)}];" if matlab else "\n".join(rows)
+    (folder / "calibration.txt").write_text(text + "\n")
+    for i in range(3):
+        lines = []
+        for (a, b), matches in sorted(graph.matches.items()):
+            if a == i:
+                for k, m in matches.tolist():
+                    u, v = graph.keypoints[a][k] - 0.5
+                    x, y = graph.keypoints[b][m] - 0.5
+                    place = " ".join(repr(float(c)) for c in (u, v))
+                    other = " ".join(repr(float(c)) for c in (x, y))
+                    lines.append(f"2 10 20 30 {place} {b + 1} {other} ")
+        end = "\r\n" if matlab else "\n"
+        (folder / f"matching{i + 1}.txt").write_bytes(end.join([f"nFeatures: {len(lines)}", *lines, ""]).encode())
+    return scene.truth
+
+
+@pytest.mark.parametrize("matlab", [False, True], ids=["plain, LF", "MATLAB, CRLF"])
+def test_course_folder_gives_model_table_and_report(tmp_path, matlab):
+    truth = write_course_folder(tmp_path / "scene", matlab=matlab)
+    out = tmp_path / "out"
+    assert main(["reconstruct", str(tmp_path / "scene"), "-o", str(out)]) == 0
+    record = json.loads((out / "run.json").read_text())
+    assert record["summary"]["registered"] == 4
+    assert {row["stage"] for row in record["table"]} >= {"linear triangulation", "PnP RANSAC", "after BA"}
+    assert record["summary"]["rms_px"] < 0.3 * np.sqrt(2) * 1.1
+    model = read_colmap(out / "sparse" / "0")
+    by_number = {f"{int(Path(v.name).stem.split('_')[-1])}": v for v in model.views}
+    assert len(by_number) == 4
+    renamed = [v.name for v in sorted(model.views, key=lambda v: v.name)]
+    names = dict(zip(renamed, [v.name for v in truth.views], strict=True))
+    views = tuple(type(v)(names[v.name], v.camera, v.cam_from_world) for v in model.views)
+    assert_reconstruction_near(
+        Reconstruction(model.cameras, views, model.points, model.observations),
+        truth,
+        angle_deg=0.2,
+        relative_distance=0.01,
+    )
+    assert (out / "points.ply").stat().st_size > 1000
+    assert "Content-Security-Policy" in (out / "report.html").read_text()
+    assert not list(out.rglob(".writing-*"))
+
+
+def test_hall_beats_the_peer_and_the_peer_agrees_on_the_error(tmp_path):
+    """pycolmap on the same matches and K: 2,673 observations of 754 points at 0.533 px."""
+    folder = data_folder("unity_hall")
+    assert main(["reconstruct", str(folder), "-o", str(tmp_path)]) == 0
+    summary = json.loads((tmp_path / "run.json").read_text())["summary"]
+    assert summary["registered"] == summary["photos"] == 5
+    assert summary["observations"] >= 2700
+    assert summary["points"] >= 850
+    assert summary["mean_px"] <= 0.55
+    pycolmap = pytest.importorskip("pycolmap")
+    other = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    errors = [
+        np.linalg.norm(image.project_point(other.points3D[p.point3D_id].xyz) - p.xy)
+        for image in other.images.values()
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    assert len(errors) == summary["observations"]
+    assert abs(np.mean(errors) - summary["mean_px"]) < 1e-3
+
+
+@pytest.fixture
+def course(tmp_path) -> Path:
+    write_course_folder(tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def broken(course: Path, case: str) -> None:
+    matching = course / "matching1.txt"
+    first = matching.read_text().splitlines()[1].split()
+    match case:
+        case "count":
+            edit(matching, "2 10 20 30", "7 10 20 30")
+        case "negative":
+            edit(matching, first[4], "-5.5")
+        case "nan":
+            edit(matching, first[4], "nan")
+        case "zero id":
+            edit(matching, " ".join(first), " ".join([*first[:6], "0", *first[7:]]))
+        case "zero focal":
+            (course / "calibration.txt").write_text("0 0 500\n0 800 300\n0 0 1\n")
+        case "empty":
+            shutil.rmtree(course)
+            course.mkdir()
+
+
+@pytest.mark.parametrize("case", ["count", "negative", "nan", "zero id", "zero focal", "empty"])
+def test_bad_input_is_one_line_and_nothing_is_written(course, tmp_path, capsys, case):
+    broken(course, case)
+    out = tmp_path / "out"
+    assert main(["reconstruct", str(course), "-o", str(out)]) == 3
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert message.startswith("fieldstone: ")
+    assert "Traceback" not in message
+    assert str(course) in message
+    if case in ("count", "negative", "nan", "zero id"):
+        assert "matching1.txt" in message
+        assert "line 2" in message or ":2" in message
+    assert not out.exists() or not any(out.iterdir())
+
+
+def test_one_photo_or_none_is_refused(tmp_path, capsys):
+    from PIL import Image
+
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    Image.new("RGB", (64, 48)).save(folder / "a.png")
+    (folder / "b.jpg").write_bytes(b"not a photo")
+    assert main(["reconstruct", str(folder), "-o", str(tmp_path / "out")]) == 3
+    message = capsys.readouterr().err
+    assert "two readable photos" in message
+    assert "b.jpg" in message
+    assert main(["reconstruct", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 3
