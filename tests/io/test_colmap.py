@@ -197,6 +197,7 @@ def test_tracks_of_images_without_keypoints_are_dropped_and_counted(tmp_path, ca
         ({"cameras": "8 SIMPLE_PINHOLE 640 480 1 1 1"}, "has camera 7, which the model lacks"),
         ({"images": "9 1 0 0 0 0 0 0 7\n\n"}, "images.txt, line 1: an image needs"),
         ({"images": "9 0 0 0 0 0 0 0 7 a\n\n"}, "line 1: image 9: a quaternion is zero"),
+        ({"images": "9 1e200 0 0 0 0 0 0 7 a\n\n"}, "line 1: image 9: the quaternion of a is no rotation"),
         ({"images": "9 1 0 0 0 nan 0 0 7 a\n\n"}, "line 1: image 9: the pose of a is not finite"),
         ({"images": "9 1 0 0 0 0 0 0 7 a\n1 2\n"}, "line 2: keypoints are x, y"),
         ({"images": "9 1 0 0 0 0 0 0 7 a\n1 inf -1\n"}, "keypoint 0 of a is not finite"),

@@ -228,6 +228,14 @@ def test_folders_that_cannot_be_used_say_why(tmp_path, change, message):
         read_matching_txt(tmp_path)
 
 
+def test_a_file_without_features_is_read(tmp_path):
+    scene = make_scene()
+    write_course_folder(tmp_path, scene)
+    (tmp_path / "matching2.txt").write_text("nFeatures: 0")
+    graph = read_course_folder(tmp_path).graph
+    assert set(graph.matches) == {pair for pair in scene.graph.matches if pair[0] != 1}
+
+
 def test_a_course_folder_is_known_by_its_match_files(tmp_path):
     (tmp_path / "calibration.txt").write_text(K_TEXT)
     assert not is_course_folder(tmp_path)

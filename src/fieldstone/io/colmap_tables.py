@@ -12,6 +12,8 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import from_wxyz
 from fieldstone.io.names import name_problem
 
+MAX_QUATERNION = 1e6
+"""Files may hold quaternions that are not normalised, but not by so much."""
 NO_POINT = -1
 """`point3D_id` of a keypoint that shows no point (2^64 - 1 in binary files, read as a signed number)."""
 COLMAP_MODEL_NAMES = (
@@ -81,6 +83,8 @@ def make_image(
         raise ValueError(problem)
     if not np.isfinite(wxyz_t).all():
         raise ValueError(f"the pose of {name} is not finite")
+    if np.abs(wxyz_t[:4]).max() > MAX_QUATERNION:
+        raise ValueError(f"the quaternion of {name} is no rotation: {wxyz_t[:4].tolist()}")
     if not np.isfinite(pixels).all():
         raise ValueError(f"keypoint {int(np.argmin(np.isfinite(pixels).all(axis=1)))} of {name} is not finite")
     pose = Rigid3(from_wxyz(wxyz_t[:4]), wxyz_t[4:])

@@ -183,10 +183,10 @@ def _read_matching_file(path: Path, image: int) -> _MatchingFile:
     line = np.flatnonzero(length) + first + 2
     length = length[length > 0]
     values = _parse_numbers(path, tokens, first + 2)
-    start = np.concatenate([[0], np.cumsum(length)[:-1]]).astype(np.int64)
+    start = np.cumsum(length) - length
 
     _check_rows(path, line, length < 6, "a feature needs at least 6 numbers: count, R G B, u v")
-    count = values[start] if len(start) else np.empty(0)
+    count = values[start]
     _check_rows(path, line, (count < 1) | (count != np.round(count)), "the number of photos must be 1 or more")
     expected = 6 + 3 * (count - 1)
     _check_rows(path, line, length != expected, "the number of photos does not fit the length of the line")
