@@ -19,12 +19,19 @@ CAMERAS = (
 
 
 def mixed_problem(
-    *, num_views: int = 6, num_points: int = 30, noise_px: float = 0.5, fixed: bool = True, seed: int = 0
+    *,
+    num_views: int = 6,
+    num_points: int = 30,
+    noise_px: float = 0.5,
+    fixed: bool = True,
+    reach: int | None = None,
+    seed: int = 0,
 ) -> BundleProblem:
     """Cameras on an arc around a cloud, every point seen by some of them, pixels with Gaussian noise.
 
     View 1 has a camera of its own (OPENCV); the others share SIMPLE_RADIAL and PINHOLE. Parameters are refined in
-    patterns that leave gaps. With `fixed`, view 2 and point 3 are held.
+    patterns that leave gaps. With `fixed`, view 2 and point 3 are held. With `reach`, a point is seen only by views
+    up to that many steps from its own place on a ring of views: the reduced camera system is then sparse.
     """
     rng = np.random.default_rng(seed)
     camera_of_view = np.where(np.arange(num_views) == 1, 1, np.where(np.arange(num_views) % 3 == 2, 2, 0))
@@ -33,6 +40,10 @@ def mixed_problem(
     points = rng.uniform(-1, 1, size=(num_points, 3))
     seen = rng.random((num_views, num_points)) < 0.8
     seen[:2] = True
+    if reach is not None:
+        place = np.arange(num_points) * num_views // num_points
+        apart = np.abs(np.arange(num_views)[:, None] - place)
+        seen = np.minimum(apart, num_views - apart) <= reach
     view, point = np.nonzero(seen)
     shuffled = rng.permutation(len(view))
     view, point = view[shuffled], point[shuffled]

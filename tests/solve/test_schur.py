@@ -6,7 +6,7 @@ import pytest
 from bundle_worlds import mixed_problem, perturbed, without_refinement
 from fieldstone.geometry import rotation
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.bundle_layout import lay_out, pad_params
+from fieldstone.solve.bundle_layout import lay_out
 from fieldstone.solve.bundle_problem import BundleProblem, reprojection_residuals, updated
 from fieldstone.solve.robust_loss import cauchy, huber, trivial
 from fieldstone.solve.schur import damped_step, normal_equations, reduced_camera_system
@@ -19,6 +19,7 @@ from fieldstone.solve.schur_solver import (
     linearize,
     move,
     solve_step,
+    start_values,
     tile_pattern,
 )
 
@@ -29,6 +30,7 @@ PROBLEMS = {
     "nothing held": perturbed(mixed_problem(fixed=False)),
     "poses only": perturbed(without_refinement(mixed_problem())),
     "many views": perturbed(mixed_problem(num_views=45, num_points=40)),
+    "sparse": perturbed(mixed_problem(num_views=100, num_points=150, reach=3)),
     "points only": replace(without_refinement(perturbed(mixed_problem())), fixed_views=np.ones(6, dtype=bool)),
     "cameras only": replace(perturbed(mixed_problem()), fixed_points=np.ones(30, dtype=bool)),
 }
@@ -36,7 +38,7 @@ PROBLEMS = {
 
 def compiled_step(problem: BundleProblem, loss: tuple[int, float], damping: float) -> tuple[Values, float, float]:
     layout = lay_out(problem, np.ones(len(problem.view), dtype=bool))
-    values = Values(problem.cam_from_world.R, problem.cam_from_world.t, problem.points, pad_params(problem))
+    values = start_values(problem, layout)
     workers, pattern = Workers(None, 1), tile_pattern(layout)
     work, at = allocate(layout, pattern), allocate_linearization(layout)
     cost = linearize(layout, values, loss, at, workers)
@@ -44,7 +46,9 @@ def compiled_step(problem: BundleProblem, loss: tuple[int, float], damping: floa
     step = solve_step(layout, pattern, values, PIVOT, at, system, damping, work, workers)
     assert step is not None
     moved, promised = move(layout, values, PIVOT, at, step, damping, work, workers)
-    return moved, cost, promised
+    points = np.empty_like(moved.points)
+    points[layout.point_order] = moved.points
+    return replace(moved, points=points), cost, promised
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

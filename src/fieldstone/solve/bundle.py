@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.bundle_layout import BundleLayout, lay_out, pad_params
+from fieldstone.solve.bundle_layout import BundleLayout, lay_out
 from fieldstone.solve.bundle_problem import BundleProblem
 from fieldstone.solve.camera_prior import (
     CameraPrior,
@@ -39,6 +39,7 @@ from fieldstone.solve.schur_solver import (
     linearize,
     move,
     solve_step,
+    start_values,
     tile_pattern,
 )
 
@@ -132,13 +133,8 @@ def bundle_adjust(problem: BundleProblem, options: BundleOptions | None = None) 
     """
     options = options or BundleOptions()
     usable = _in_front(problem)
-    start = Values(
-        np.ascontiguousarray(problem.cam_from_world.R, dtype=np.float64),
-        np.ascontiguousarray(problem.cam_from_world.t, dtype=np.float64),
-        np.ascontiguousarray(problem.points, dtype=np.float64),
-        pad_params(problem),
-    )
     layout = lay_out(problem, usable)
+    start = start_values(problem, layout)
     if layout.num_columns + layout.num_border == 0 and not np.any(layout.free_point[layout.point]):
         return BundleResult(problem, 0.0, 0.0, 0, "nothing to refine", usable)
     pool = ThreadPoolExecutor(options.threads) if options.threads > 1 else None
@@ -155,7 +151,7 @@ def bundle_adjust(problem: BundleProblem, options: BundleOptions | None = None) 
         if pool is not None:
             pool.shutdown()
     logger.info("bundle adjustment: cost %.6g to %.6g in %d steps, %s", costs[0], costs[-1], iterations, reason)
-    adjusted = _with_values(problem, values)
+    adjusted = _with_values(problem, layout, values)
     if options.keep_gauge and not (np.any(problem.fixed_views) or np.any(problem.fixed_points)):
         adjusted = _restore_gauge(adjusted, problem, int(layout.listed_view.min()))
     return BundleResult(adjusted, costs[0], costs[-1], iterations, reason, usable, tuple(costs))
@@ -245,13 +241,15 @@ def _in_front(problem: BundleProblem) -> Bool[np.ndarray, "o"]:
     return (depth + problem.cam_from_world.t[problem.view, 2] > 0) & np.isfinite(problem.pixels).all(axis=1)
 
 
-def _with_values(problem: BundleProblem, values: Values) -> BundleProblem:
+def _with_values(problem: BundleProblem, layout: BundleLayout, values: Values) -> BundleProblem:
     """The problem at other values; fixed parts keep their bits."""
+    points = np.empty_like(values.points)
+    points[layout.point_order] = values.points
     cameras = tuple(
         replace(camera, params=row[: len(camera.params)].copy()) if mask.any() else camera
         for camera, row, mask in zip(problem.cameras, values.params, problem.refine, strict=True)
     )
-    return replace(problem, cameras=cameras, cam_from_world=Rigid3(values.R, values.t), points=values.points)
+    return replace(problem, cameras=cameras, cam_from_world=Rigid3(values.R, values.t), points=points)
 
 
 def _restore_gauge(adjusted: BundleProblem, before: BundleProblem, view: int) -> BundleProblem:

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from fieldstone.geometry.camera import CAMERA_MODELS
 from fieldstone.solve.bundle_problem import BundleProblem
-from fieldstone.solve.projection_numba import MAX_CAMERA_PARAMS
+from fieldstone.solve.sorting_numba import border_entries_numba, counting_order_numba
 
 MIN_VIEWS_TO_ORDER = 40
 
@@ -25,11 +25,12 @@ MIN_VIEWS_TO_ORDER = 40
 class BundleLayout:
     """Index arrays of one problem; observations sorted by point, then slot (fixed views first).
 
-    Observations of points that start behind their camera are left out.
+    Points are numbered by the first slot that sees them, so that what a slot reads lies close together. Observations
+    of points that start behind their camera are left out.
     """
 
-    order: Int[np.ndarray, "o"]
-    """Row of the problem that each sorted observation comes from."""
+    point_order: Int[np.ndarray, "p"]
+    """Number in the problem of each point here."""
     view: Int[np.ndarray, "o"]
     point: Int[np.ndarray, "o"]
     slot: Int[np.ndarray, "o"]
@@ -75,14 +76,6 @@ class BundleLayout:
         return self.num_slots * self.block
 
 
-def pad_params(problem: BundleProblem) -> Float[np.ndarray, "c 12"]:
-    """Camera parameters, padded with zeros to one length."""
-    out = np.zeros((len(problem.cameras), MAX_CAMERA_PARAMS))
-    for row, camera in zip(out, problem.cameras, strict=True):
-        row[: len(camera.params)] = camera.params
-    return out
-
-
 def lay_out(problem: BundleProblem, usable: Bool[np.ndarray, "o"]) -> BundleLayout:
     """Sort the usable observations and assign every free parameter its column."""
     num_points = len(problem.points)
@@ -97,29 +90,36 @@ def lay_out(problem: BundleProblem, usable: Bool[np.ndarray, "o"]) -> BundleLayo
     own, border_of_camera, num_border = _place_cameras(problem, slot_of_view, num_active, has_rows)
     block = 6 + int(num_active[own].max(initial=0))
 
+    num_slots = len(view_of_slot)
     slot = slot_of_view[problem.view[rows]]
-    order = rows[np.lexsort((slot, problem.point[rows]))]
-    view, point = problem.view[order], problem.point[order]
-    slot = slot_of_view[view]
+    first_slot = np.full(num_points, num_slots)
+    np.minimum.at(first_slot, problem.point[rows], np.where(slot < 0, num_slots, slot))
+    point_order, _ = counting_order_numba(first_slot, num_slots + 1)
+    rank = np.empty(num_points, dtype=np.int64)
+    rank[point_order] = np.arange(num_points)
+    by_slot, _ = counting_order_numba(slot + 1, num_slots + 1)
+    by_point, point_start = counting_order_numba(rank[problem.point[rows[by_slot]]], num_points)
+    order = rows[by_slot[by_point]]
+    view, point = problem.view[order], rank[problem.point[order]]
+
     listed_view = np.concatenate([view_of_slot, np.setdiff1d(np.flatnonzero(has_rows), view_of_slot)])
     place_in_list = np.full(problem.num_views, -1)
     place_in_list[listed_view] = np.arange(len(listed_view))
-    place = place_in_list[view]
-    list_obs = np.argsort(place, kind="stable")
-
-    entry_of_obs, entry_point, entry_camera = _border_entries(problem, view, point, border_of_camera)
-    border_entries = np.argsort(entry_camera, kind="stable")
+    list_obs, list_start = counting_order_numba(place_in_list[view], len(listed_view))
+    camera = problem.camera_of_view[view]
+    entry_of_obs, entry_start, entry_camera = border_entries_numba(point_start, camera, border_of_camera)
+    border_entries, border_start = counting_order_numba(entry_camera, len(problem.cameras))
     return BundleLayout(
-        order=order,
+        point_order=point_order,
         view=view,
         point=point,
-        slot=slot,
+        slot=slot_of_view[view],
         pixels=np.ascontiguousarray(problem.pixels[order], dtype=np.float64),
-        point_start=np.searchsorted(point, np.arange(num_points + 1)),
+        point_start=point_start,
         listed_view=listed_view,
-        list_start=np.searchsorted(place[list_obs], np.arange(len(listed_view) + 1)),
+        list_start=list_start,
         list_obs=list_obs,
-        num_slots=len(view_of_slot),
+        num_slots=num_slots,
         camera_of_view=np.asarray(problem.camera_of_view, dtype=np.int64),
         model=np.array([camera.spec.colmap_id for camera in problem.cameras], dtype=np.int64),
         active=active,
@@ -128,13 +128,13 @@ def lay_out(problem: BundleProblem, usable: Bool[np.ndarray, "o"]) -> BundleLayo
         block=block,
         border_of_camera=border_of_camera,
         num_border=num_border,
-        entry_start=np.searchsorted(entry_point, np.arange(num_points + 1)),
+        entry_start=entry_start,
         entry_camera=entry_camera,
         entry_of_obs=entry_of_obs,
-        border_start=np.searchsorted(entry_camera[border_entries], np.arange(len(problem.cameras) + 1)),
+        border_start=border_start,
         border_entries=border_entries,
-        entry_point=entry_point,
-        free_point=~problem.fixed_points,
+        entry_point=np.repeat(np.arange(num_points), np.diff(entry_start)),
+        free_point=~problem.fixed_points[point_order],
     )
 
 
@@ -181,21 +181,3 @@ def _ordering(
     free_rows = seen.tocsr()[free_views]
     covisible = (free_rows @ free_rows.T).tocsr()
     return np.asarray(reverse_cuthill_mckee(covisible, symmetric_mode=True), dtype=np.int64)
-
-
-def _border_entries(
-    problem: BundleProblem,
-    view: Int[np.ndarray, "o"],
-    point: Int[np.ndarray, "o"],
-    border_of_camera: Int[np.ndarray, "c"],
-) -> tuple[Int[np.ndarray, "o"], Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
-    """Entry of each observation (-1: none), and the point and camera of each entry, sorted by point."""
-    camera = problem.camera_of_view[view]
-    num_cameras = len(problem.cameras)
-    in_border = border_of_camera[camera] >= 0
-    key = point[in_border] * num_cameras + camera[in_border]
-    entries, inverse = np.unique(key, return_inverse=True)
-    entry_of_obs = np.full(len(view), -1)
-    entry_of_obs[in_border] = inverse
-    entry_point, entry_camera = np.divmod(entries, num_cameras)
-    return entry_of_obs, entry_point, entry_camera

@@ -5,7 +5,8 @@ Ranges can therefore run in any number of threads, and the result has the same b
 
 Notation, for observation o of point p by the view in slot i (Cholesky: V + damping = L L^T, V the 3x3 block of p):
 Z (3, block) = L^-1 B^T [pose Jacobian | own camera Jacobian], with the Jacobians of `linearize_numba`, so that the
-reduced system loses Z_i^T Z_j for every point that slots i and j share.
+reduced system loses Z_i^T Z_j for every point that slots i and j share. The rows of Z are [d x h, h, own] with
+h = L^-1 B^T B: only [h, own] is stored, (3, block - 3), and the rotation's part d x h is made where it is needed.
 """
 
 from __future__ import annotations
@@ -20,13 +21,12 @@ from numba import njit
 @no_type_check
 def eliminate_points_numba(
     start, stop, view, slot, point_start, camera_of_view, num_active, own, entry_start, entry_of_obs, free_point,
-    points, pivot, B, J_camera, V, g_point, damping, L_inv, y, Z, Z_border,
+    B, J_camera, V, g_point, damping, L_inv, y, Z, Z_border,
 ):  # fmt: skip
-    """L_inv (p, 6 lower), y = L^-1 g (p, 3), Z (o, 3, block) and Z_border (e, 3, a) for V + damping diag(V).
+    """L_inv (p, 6 lower), y = L^-1 g (p, 3), Z (o, 3, block - 3) and Z_border (e, 3, a) for V + damping diag(V).
 
     Held points, and points whose block is singular, get L_inv = 0: they do not move in this step.
     """
-    block = Z.shape[2]
     grow = 1.0 + damping
     for p in range(start, stop):
         for e in range(entry_start[p], entry_start[p + 1]):
@@ -42,7 +42,6 @@ def eliminate_points_numba(
         y[p, 0] = a0 * g_point[p, 0]
         y[p, 1] = a1 * g_point[p, 0] + a2 * g_point[p, 1]
         y[p, 2] = a3 * g_point[p, 0] + a4 * g_point[p, 1] + a5 * g_point[p, 2]
-        d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
         for o in range(point_start[p], point_start[p + 1]):
             c = camera_of_view[view[o]]
             e = entry_of_obs[o]
@@ -57,17 +56,11 @@ def eliminate_points_numba(
                 q0 = B[o, 0, 0] * m0 + B[o, 0, 1] * m1 + B[o, 0, 2] * m2
                 q1 = B[o, 1, 0] * m0 + B[o, 1, 1] * m1 + B[o, 1, 2] * m2
                 if in_slot:
-                    h0 = q0 * B[o, 0, 0] + q1 * B[o, 1, 0]
-                    h1 = q0 * B[o, 0, 1] + q1 * B[o, 1, 1]
-                    h2 = q0 * B[o, 0, 2] + q1 * B[o, 1, 2]
-                    Z[o, k, 0] = d1 * h2 - d2 * h1
-                    Z[o, k, 1] = d2 * h0 - d0 * h2
-                    Z[o, k, 2] = d0 * h1 - d1 * h0
-                    Z[o, k, 3] = h0
-                    Z[o, k, 4] = h1
-                    Z[o, k, 5] = h2
-                    for a in range(block - 6):
-                        Z[o, k, 6 + a] = q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a] if a < num_own else 0.0
+                    Z[o, k, 0] = q0 * B[o, 0, 0] + q1 * B[o, 1, 0]
+                    Z[o, k, 1] = q0 * B[o, 0, 1] + q1 * B[o, 1, 1]
+                    Z[o, k, 2] = q0 * B[o, 0, 2] + q1 * B[o, 1, 2]
+                    for a in range(Z.shape[2] - 3):
+                        Z[o, k, 3 + a] = q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a] if a < num_own else 0.0
                 if e >= 0:
                     for a in range(num_active[c]):
                         Z_border[e, k, a] += q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a]
@@ -96,19 +89,16 @@ def _inverse_cholesky_numba(v00, v10, v11, v20, v21, v22):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _subtract_pose_product_numba(d0, d1, d2, z, w, target):
-    """target (6, 6) -= Z^T W for two observations of one point.
-
-    Only the last three columns h of the pose part are read: the first three are d x h, for both.
-    """
-    k00 = z[0, 3] * w[0, 3] + z[1, 3] * w[1, 3] + z[2, 3] * w[2, 3]
-    k01 = z[0, 3] * w[0, 4] + z[1, 3] * w[1, 4] + z[2, 3] * w[2, 4]
-    k02 = z[0, 3] * w[0, 5] + z[1, 3] * w[1, 5] + z[2, 3] * w[2, 5]
-    k10 = z[0, 4] * w[0, 3] + z[1, 4] * w[1, 3] + z[2, 4] * w[2, 3]
-    k11 = z[0, 4] * w[0, 4] + z[1, 4] * w[1, 4] + z[2, 4] * w[2, 4]
-    k12 = z[0, 4] * w[0, 5] + z[1, 4] * w[1, 5] + z[2, 4] * w[2, 5]
-    k20 = z[0, 5] * w[0, 3] + z[1, 5] * w[1, 3] + z[2, 5] * w[2, 3]
-    k21 = z[0, 5] * w[0, 4] + z[1, 5] * w[1, 4] + z[2, 5] * w[2, 4]
-    k22 = z[0, 5] * w[0, 5] + z[1, 5] * w[1, 5] + z[2, 5] * w[2, 5]
+    """target (6, 6) -= [d x z, z]^T [d x w, w] for the stored parts z, w of two observations of one point."""
+    k00 = z[0, 0] * w[0, 0] + z[1, 0] * w[1, 0] + z[2, 0] * w[2, 0]
+    k01 = z[0, 0] * w[0, 1] + z[1, 0] * w[1, 1] + z[2, 0] * w[2, 1]
+    k02 = z[0, 0] * w[0, 2] + z[1, 0] * w[1, 2] + z[2, 0] * w[2, 2]
+    k10 = z[0, 1] * w[0, 0] + z[1, 1] * w[1, 0] + z[2, 1] * w[2, 0]
+    k11 = z[0, 1] * w[0, 1] + z[1, 1] * w[1, 1] + z[2, 1] * w[2, 1]
+    k12 = z[0, 1] * w[0, 2] + z[1, 1] * w[1, 2] + z[2, 1] * w[2, 2]
+    k20 = z[0, 2] * w[0, 0] + z[1, 2] * w[1, 0] + z[2, 2] * w[2, 0]
+    k21 = z[0, 2] * w[0, 1] + z[1, 2] * w[1, 1] + z[2, 2] * w[2, 1]
+    k22 = z[0, 2] * w[0, 2] + z[1, 2] * w[1, 2] + z[2, 2] * w[2, 2]
     for a in range(6):
         if a == 0:
             q0, q1, q2 = d1 * k20 - d2 * k10, d1 * k21 - d2 * k11, d1 * k22 - d2 * k12
@@ -132,6 +122,19 @@ def _subtract_pose_product_numba(d0, d1, d2, z, w, target):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def _unfold_numba(d0, d1, d2, z, full):
+    """full (3, block) = [d x h, h, own] from the stored z = [h, own]."""
+    for k in range(3):
+        h0, h1, h2 = z[k, 0], z[k, 1], z[k, 2]
+        full[k, 0] = d1 * h2 - d2 * h1
+        full[k, 1] = d2 * h0 - d0 * h2
+        full[k, 2] = d0 * h1 - d1 * h0
+        for a in range(z.shape[1]):
+            full[k, 3 + a] = z[k, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def reduce_rows_numba(
     start, stop, step, list_start, list_obs, slot, point, point_start, free_point, entry_start, entry_camera,
     num_active, border_of_camera, tile_index, tiles, points, pivot, U, g, cross, damping, y, Z, Z_border, border, rhs,
@@ -143,9 +146,14 @@ def reduce_rows_numba(
     Pairs without a tile are left out (block-diagonal preconditioners ask for few tiles).
     """
     per_tile = tiles.shape[1]
-    block = Z.shape[2]
+    block = Z.shape[2] + 3
+    z = np.empty((3, block))
+    w = np.empty((3, block))
+    tile_of_slot = np.empty(stop, dtype=np.int64)
+    for i in range(stop):
+        tile_of_slot[i] = i // per_tile
     for i in range(start, stop, step):
-        tile_row = i // per_tile
+        tile_row = tile_of_slot[i]
         local_row = i - tile_row * per_tile
         for J in range(tile_row + 1):
             tile = tile_index[tile_row, J]
@@ -167,7 +175,7 @@ def reduce_rows_numba(
             if not free_point[p]:
                 continue
             d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
-            z = Z[o]
+            _unfold_numba(d0, d1, d2, Z[o], z)
             for a in range(block):
                 rhs[i, a] += z[0, a] * y[p, 0] + z[1, a] * y[p, 1] + z[2, a] * y[p, 2]
             for o2 in range(point_start[p], point_start[p + 1]):
@@ -176,15 +184,15 @@ def reduce_rows_numba(
                     continue
                 if j > i:
                     break
-                J = j // per_tile
+                J = tile_of_slot[j]
                 tile = tile_index[tile_row, J]
                 if tile < 0:
                     continue
                 target = tiles[tile, local_row, j - J * per_tile]
-                w = Z[o2]
                 if block == 6:
-                    _subtract_pose_product_numba(d0, d1, d2, z, w, target)
+                    _subtract_pose_product_numba(d0, d1, d2, Z[o], Z[o2], target)
                 else:
+                    _unfold_numba(d0, d1, d2, Z[o2], w)
                     for a in range(block):
                         z0, z1, z2 = z[0, a], z[1, a], z[2, a]
                         for b in range(block):
@@ -212,8 +220,10 @@ def reduce_border_numba(
             for a in range(num_active[c]):
                 z0, z1, z2 = Z_border[e, 0, a], Z_border[e, 1, a], Z_border[e, 2, a]
                 rhs_border[row + a] += z0 * y[p, 0] + z1 * y[p, 1] + z2 * y[p, 2]
-                for e2 in range(entry_start[p], e + 1):
+                for e2 in range(entry_start[p], entry_start[p + 1]):
                     column = border_of_camera[entry_camera[e2]]
+                    if column > row:
+                        continue
                     for b in range(num_active[entry_camera[e2]]):
                         corner[row + a, column + b] -= (
                             z0 * Z_border[e2, 0, b] + z1 * Z_border[e2, 1, b] + z2 * Z_border[e2, 2, b]
@@ -223,23 +233,30 @@ def reduce_border_numba(
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def move_points_numba(
-    start, stop, slot, point_start, entry_start, entry_camera, num_active, border_of_camera, points,
+    start, stop, slot, point_start, entry_start, entry_camera, num_active, border_of_camera, points, pivot,
     V, g_point, damping, L_inv, y, Z, Z_border, dx, dx_border, points_new, decrease,
 ):  # fmt: skip
     """Points that belong to the step dx (s, block), dx_border of the cameras: step = -L^-T (y + sum Z dx).
 
     `decrease` (p,) is each point's share of the decrease of the cost that the linear model promises.
     """
-    block = Z.shape[2]
     for p in range(start, stop):
         u0, u1, u2 = y[p, 0], y[p, 1], y[p, 2]
+        d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
         for o in range(point_start[p], point_start[p + 1]):
             i = slot[o]
             if i >= 0:
-                for a in range(block):
-                    u0 += Z[o, 0, a] * dx[i, a]
-                    u1 += Z[o, 1, a] * dx[i, a]
-                    u2 += Z[o, 2, a] * dx[i, a]
+                w0, w1, w2 = dx[i, 0], dx[i, 1], dx[i, 2]
+                m0 = dx[i, 3] + w1 * d2 - w2 * d1  # (d x h) omega + h v = h (v + omega x d)
+                m1 = dx[i, 4] + w2 * d0 - w0 * d2
+                m2 = dx[i, 5] + w0 * d1 - w1 * d0
+                u0 += Z[o, 0, 0] * m0 + Z[o, 0, 1] * m1 + Z[o, 0, 2] * m2
+                u1 += Z[o, 1, 0] * m0 + Z[o, 1, 1] * m1 + Z[o, 1, 2] * m2
+                u2 += Z[o, 2, 0] * m0 + Z[o, 2, 1] * m1 + Z[o, 2, 2] * m2
+                for a in range(3, Z.shape[2]):
+                    u0 += Z[o, 0, a] * dx[i, 3 + a]
+                    u1 += Z[o, 1, a] * dx[i, 3 + a]
+                    u2 += Z[o, 2, a] * dx[i, 3 + a]
         for e in range(entry_start[p], entry_start[p + 1]):
             c = entry_camera[e]
             for a in range(num_active[c]):

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.solve.bundle_layout import BundleLayout
+from fieldstone.solve.bundle_problem import BundleProblem
 from fieldstone.solve.linearize_numba import gather_cameras_numba, linearize_points_numba, linearize_views_numba
+from fieldstone.solve.projection_numba import MAX_CAMERA_PARAMS
 from fieldstone.solve.schur_numba import (
     eliminate_points_numba,
     move_points_numba,
@@ -34,7 +36,7 @@ MAX_SINGLE_TILE = 128
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """What is being solved for: poses, points, camera parameters (padded)."""
+    """What is being solved for: poses, points (in the layout's order), camera parameters (padded)."""
 
     R: Float[np.ndarray, "v 3 3"]
     t: Float[np.ndarray, "v 3"]
@@ -80,6 +82,11 @@ class TilePattern:
     num_products: int
     """Tile products of one factorisation."""
 
+    @property
+    def given_index(self) -> Int[np.ndarray, "t t"]:
+        """`index` without the tiles that only factorisation fills in."""
+        return np.where(self.index < self.num_given, self.index, -1)
+
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
@@ -101,7 +108,7 @@ class Workspace:
     g_view: Float[np.ndarray, "l n"]
     L_inv: Float[np.ndarray, "p 6"]
     y: Float[np.ndarray, "p 3"]
-    Z: Float[np.ndarray, "o 3 b"]
+    Z: Float[np.ndarray, "o 3 h"]
     Z_border: Float[np.ndarray, "e 3 a"]
     decrease: Float[np.ndarray, "p"]
     tiles: Float[np.ndarray, "t k k b b"]
@@ -127,6 +134,19 @@ class Step:
     dx: Float[np.ndarray, "s b"]
     dx_border: Float[np.ndarray, "n"]
     decrease: float
+
+
+def start_values(problem: BundleProblem, layout: BundleLayout) -> Values:
+    """The values that a problem starts from."""
+    params = np.zeros((len(problem.cameras), MAX_CAMERA_PARAMS))
+    for row, camera in zip(params, problem.cameras, strict=True):
+        row[: len(camera.params)] = camera.params
+    return Values(
+        np.ascontiguousarray(problem.cam_from_world.R, dtype=np.float64),
+        np.ascontiguousarray(problem.cam_from_world.t, dtype=np.float64),
+        np.ascontiguousarray(problem.points[layout.point_order], dtype=np.float64),
+        params,
+    )
 
 
 def tile_pattern(layout: BundleLayout) -> TilePattern:
@@ -177,7 +197,7 @@ def allocate(layout: BundleLayout, pattern: TilePattern) -> Workspace:
         g_view=np.empty((num_lists, 6 + num_active)),
         L_inv=np.empty((num_points, 6)),
         y=np.empty((num_points, 3)),
-        Z=np.empty((num_obs, 3, block)),
+        Z=np.empty((num_obs, 3, block - 3)),
         Z_border=np.empty((len(layout.entry_camera), 3, num_active)),
         decrease=np.empty(num_points),
         tiles=np.empty((pattern.num_given, pattern.per_tile, pattern.per_tile, block, block)),
@@ -226,7 +246,7 @@ def solve_step(
     workers.over(
         eliminate_points_numba, workers.split(layout.point_start),
         layout.view, layout.slot, layout.point_start, layout.camera_of_view, layout.num_active, layout.own,
-        layout.entry_start, layout.entry_of_obs, layout.free_point, values.points, pivot, at.B, at.J_camera,
+        layout.entry_start, layout.entry_of_obs, layout.free_point, at.B, at.J_camera,
         at.V, at.g_point, damping, work.L_inv, work.y, work.Z, work.Z_border,
     )  # fmt: skip
     s, b, n = layout.num_slots, layout.block, layout.num_border
@@ -234,7 +254,7 @@ def solve_step(
     workers.over(
         reduce_rows_numba, [(k, s, workers.threads) for k in range(workers.threads)],
         layout.list_start, layout.list_obs, layout.slot, layout.point, layout.point_start, layout.free_point,
-        layout.entry_start, layout.entry_camera, layout.num_active, layout.border_of_camera, pattern.index,
+        layout.entry_start, layout.entry_camera, layout.num_active, layout.border_of_camera, pattern.given_index,
         work.tiles, values.points, pivot, system.U, system.g, system.cross, damping, work.y, work.Z, work.Z_border,
         border, rhs,
     )  # fmt: skip
@@ -323,7 +343,7 @@ def move(
     workers.over(
         move_points_numba, workers.split(layout.point_start),
         layout.slot, layout.point_start, layout.entry_start, layout.entry_camera, layout.num_active,
-        layout.border_of_camera, values.points, at.V, at.g_point, damping, work.L_inv, work.y, work.Z,
+        layout.border_of_camera, values.points, pivot, at.V, at.g_point, damping, work.L_inv, work.y, work.Z,
         work.Z_border, step.dx, step.dx_border, points, work.decrease,
     )  # fmt: skip
     return Values(R, t, points, params), step.decrease + float(np.sum(work.decrease))
