@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from fieldstone.features.matching import MutualRatio, descriptor_distances, match_mutual
-from fieldstone.features.pairs import exhaustive
 from fieldstone.scene.features import Features
 
 
@@ -71,9 +70,3 @@ def test_no_features_no_matches():
         assert MutualRatio(0.8)(*pair).shape == (0, 2)
     with pytest.raises(ValueError, match="max_ratio"):
         MutualRatio(1.5)
-
-
-def test_exhaustive_pairs_leave_out_photos_without_features():
-    empty, some = features_of(np.empty((0, 128), dtype=np.uint8)), features_of(np.ones((3, 128), dtype=np.uint8))
-    assert exhaustive([some, empty, some, some]) == [(0, 2), (0, 3), (2, 3)]
-    assert exhaustive([]) == []

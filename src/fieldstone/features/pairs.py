@@ -2,13 +2,165 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from fieldstone.features.matching import match_mutual
+from fieldstone.features.retrieval import VladOptions, similarities
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair
+
+logger = logging.getLogger(__name__)
+
+PairChooser = Callable[[Sequence[Features]], list[ImagePair]]
 
 
 def exhaustive(features: Sequence[Features]) -> list[ImagePair]:
     """All pairs (i, j), i < j, of photos that have features."""
     filled = [i for i, f in enumerate(features) if len(f)]
     return [(i, j) for k, i in enumerate(filled) for j in filled[k + 1 :]]
+
+
+def sequential(num_photos: int, window: int) -> list[ImagePair]:
+    """Pairs of photos at most `window` places apart in the order in which they were taken."""
+    return [(i, j) for i in range(num_photos) for j in range(i + 1, min(i + window + 1, num_photos))]
+
+
+def nearby(positions: Float[np.ndarray, "n 3"], num_neighbors: int) -> list[ImagePair]:
+    """Pairs of each photo with the `num_neighbors` taken nearest to it.
+
+    Args:
+        positions: In one Cartesian frame, any unit; rows with nan (photos without GPS) get no pair.
+    """
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    if len(known) < 2:
+        return []
+    distance = np.linalg.norm(positions[known][:, None] - positions[known], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, : min(num_neighbors, len(known) - 1)]
+    return ordered((int(known[i]), int(known[j])) for i, row in enumerate(nearest) for j in row)
+
+
+def ordered(pairs: Iterable[tuple[int, int]]) -> list[ImagePair]:
+    """The pairs as (smaller, larger), once each, sorted."""
+    return sorted({(int(min(p)), int(max(p))) for p in pairs})
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How many pairs are looked at, and how closely."""
+
+    max_exhaustive: int = 12
+    """Up to this many photos all pairs are matched."""
+    num_candidates: int = 40
+    """Most similar photos of each photo, whose few largest features are matched to rank them."""
+    num_preview: int = 1024
+    """Features of the largest scale used for that: a hundredth of the work of all of them."""
+    preview_ratio: float = 0.7
+    """Ratio test of the preview: stricter than that of matching, as a few false matches blur the ranking."""
+    min_preview: int = 6
+    """Pairs with fewer previewed matches are left out, except for the best few of each photo and the trees."""
+    num_neighbors: int = 20
+    """Partners of each photo that are matched wholly, at most."""
+    num_certain: int = 3
+    """Partners of each photo that are matched wholly, however few previewed matches they have."""
+    num_trees: int = 3
+    """Spanning trees added, so that no group of photos stays without a tie to the others."""
+    vlad: VladOptions = field(default_factory=VladOptions)
+
+    def __post_init__(self) -> None:
+        counts = (self.num_candidates, self.num_preview, self.num_neighbors, self.num_certain)
+        if min(counts) < 1 or self.num_trees < 0:
+            raise ValueError(f"numbers of candidates, features and partners must be at least 1, got {counts}")
+
+
+def choose_pairs(
+    features: Sequence[Features],
+    options: PairOptions,
+    rng: np.random.Generator,
+    *,
+    positions: Float[np.ndarray, "n 3"] | None = None,
+    threads: int = 1,
+) -> list[ImagePair]:
+    """All pairs of small sets; of large ones those that look alike, in number proportional to the photos.
+
+    Candidates by similarity as a whole (and by position, where it is known) are ranked by how many of their largest
+    features match; every photo keeps its best partners, and spanning trees of the same ranking tie the rest.
+
+    Source:
+        Matching a few large features first: `wu2013`, section 3.
+    """
+    if len(features) <= options.max_exhaustive:
+        return exhaustive(features)
+    alike = similarities(features, options.vlad, rng)
+    empty = np.array([len(f) == 0 for f in features])
+    alike[empty] = alike[:, empty] = -np.inf
+    np.fill_diagonal(alike, -np.inf)
+    candidates = set(most_similar(alike, options.num_candidates))
+    if positions is not None:
+        candidates |= {p for p in nearby(positions, options.num_candidates // 2) if np.isfinite(alike[p])}
+    pairs = sorted(candidates)
+    counts = preview_counts(features, pairs, options, threads=threads)
+    # Similarity lies within (-1, 1): it decides between pairs with the same number of matches.
+    score = counts + 0.5 * np.array([alike[p] for p in pairs])
+    good = counts >= options.min_preview
+    chosen = strongest(pairs, score, len(features), options.num_certain)
+    chosen |= strongest(
+        [p for p, g in zip(pairs, good, strict=True) if g], score[good], len(features), options.num_neighbors
+    )
+    chosen |= spanning_trees(pairs, score, len(features), options.num_trees)
+    logger.info("%d photos: %d pairs chosen of %d looked at", len(features), len(chosen), len(pairs))
+    return sorted(chosen)
+
+
+def most_similar(alike: Float[np.ndarray, "n n"], count: int) -> list[ImagePair]:
+    """Pairs of each photo with the `count` others of the largest finite similarity."""
+    best = np.argsort(-alike, axis=1, kind="stable")[:, :count]
+    return ordered((i, int(j)) for i, row in enumerate(best) for j in row if np.isfinite(alike[i, j]))
+
+
+def preview_counts(
+    features: Sequence[Features], pairs: Sequence[ImagePair], options: PairOptions, *, threads: int = 1
+) -> Int[np.ndarray, "p"]:
+    """Number of matches among the features of the largest scale of each pair."""
+    first = [f[np.argsort(-f.scale, kind="stable")[: options.num_preview]] for f in features]
+    with ThreadPoolExecutor(threads) as pool:
+        counts = pool.map(lambda p: len(match_mutual(first[p[0]], first[p[1]], options.preview_ratio)), pairs)
+        return np.fromiter(counts, dtype=np.int64, count=len(pairs))
+
+
+def strongest(pairs: Sequence[ImagePair], score: Float[np.ndarray, "p"], num_photos: int, count: int) -> set[ImagePair]:
+    """The `count` best pairs of every photo."""
+    of_photo: list[list[int]] = [[] for _ in range(num_photos)]
+    for k in np.argsort(-score, kind="stable").tolist():
+        for photo in pairs[k]:
+            of_photo[photo].append(k)
+    return {pairs[k] for ranked in of_photo for k in ranked[:count]}
+
+
+def spanning_trees(
+    pairs: Sequence[ImagePair], score: Float[np.ndarray, "p"], num_photos: int, count: int
+) -> set[ImagePair]:
+    """The union of `count` maximum spanning trees (forests), each of the pairs that the ones before it left."""
+    chosen: set[ImagePair] = set()
+    left = np.arange(len(pairs))
+    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    for _ in range(count):
+        if not len(left):
+            break
+        # Costs must be positive for the sparse format; equal scores go to the lower pair.
+        rank = np.empty(len(left))
+        rank[np.argsort(-score[left], kind="stable")] = np.arange(1, len(left) + 1)
+        cost = coo_matrix((rank, (ends[left, 0], ends[left, 1])), shape=(num_photos, num_photos))
+        tree = minimum_spanning_tree(cost.tocsr()).tocoo()
+        edges = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
+        chosen |= edges
+        left = np.array([k for k in left.tolist() if pairs[k] not in edges], dtype=np.int64)
+    return chosen
