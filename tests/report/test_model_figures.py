@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
@@ -81,7 +82,11 @@ def test_from_above_draws_every_point_where_it_is_and_ignores_far_outliers():
     box = axes.get_position().size * figure.get_size_inches()
     assert np.ptp(axes.get_xlim()) / box[0] == pytest.approx(np.ptp(axes.get_ylim()) / box[1])  # equal units
     assert {a.get_text() for a in drawn(figure, "name")} <= {v.name for v in truth.views}
-    assert drawn(figure, "name")
+    drawn_pixels(figure)  # places the names
+    names = [Text.get_window_extent(a) for a in drawn(figure, "name")]  # without the line to the camera
+    assert len(names) >= 3
+    assert not any(a.overlaps(b) for k, a in enumerate(names) for b in names[:k])
+    assert all(axes.bbox.x0 <= a.x0 and a.x1 <= axes.bbox.x1 for a in names)
 
 
 def replace_points(model: Reconstruction, xyz: np.ndarray) -> Reconstruction:

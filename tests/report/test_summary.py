@@ -134,6 +134,9 @@ def run_json(run) -> dict:
         },
         "how_errors_are_counted": "mean distance & <b>nothing</b> else",
         "version": "0.1.0",
+        "notes": ["focal <length> from EXIF of 3 photos"],
+        "components": [4, 2],
+        "cameras": [{"model": "PINHOLE", "width": 1000, "height": 750, "params": [800.0, 810.5, 505.0, 370.0]}],
         "truth": {"pose_error_deg_max": 0.0123, "position_error": 0.004},
     }
 
@@ -199,8 +202,19 @@ def test_photos_are_pooled_per_stage_as_if_their_errors_were_one_set(folder, map
 
 def test_key_numbers_and_verdicts_stand_first(folder):
     text = " ".join("".join(Page(page_of(folder)).text).split())
-    for part in ("4 of 5", "21.50 dB", "1 min 33 s", "0.012°", "not registered: sees 3 points", "8 <bit>", "seed 7"):
+    for part in (
+        "4 of 5",
+        "21.50 dB",
+        "1 min 33 s",
+        "0.012°",
+        "not registered: sees 3 points",
+        "8 <bit>",
+        "seed 7",
+        "4 + 2",
+    ):
         assert part in text
+    assert "focal <length> from EXIF" in text
+    assert "800, 810.5, 505, 370" in text
     assert "/home/someone" not in page_of(folder)  # where a run's photos lay is nobody's business
 
 
@@ -249,9 +263,9 @@ def test_missing_parts_leave_their_part_out(folder, tmp_path, missing):
     "run",
     [
         {"summary": {"registered": None, "points": "many", "mean_px": None}, "photos": [{}, 3, None], "table": [{}]},
-        {"table": "none", "drops": {"a": 1}, "photos": 4, "seconds": [1], "summary": [], "truth": 3},
+        {"table": "none", "drops": {"a": 1}, "photos": 4, "seconds": [1], "summary": [], "truth": 3, "notes": 5},
         {"table": [{"stage": 1, "photo": None, "points": True, "mean_px": "x"}], "seconds": {"total": 3, "map": None}},
-        {"table": [{"stage": "a", "mean_px": 0.0, "points": 0, "photo": "b"}], "seed": None, "version": ["<x>"]},
+        {"table": [{"stage": "a", "mean_px": 0.0, "points": 0, "photo": "b"}], "seed": None, "cameras": [1, {}]},
     ],
 )
 def test_odd_values_show_as_dashes(tmp_path, run):

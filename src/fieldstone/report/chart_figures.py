@@ -45,13 +45,15 @@ def error_histograms_figure(records: Sequence[StageRecord], *, theme: Theme = LI
     """Histograms of the reprojection errors of all photos, stages that belong together in one panel; log axis."""
     figure = new_figure(11.2, 3.5, theme)
     bins = np.geomspace(0.01, 100.0, 49)
-    for k, (title, stages) in enumerate(COMPARISONS):
-        axes = figure.add_axes((0.05 + k * 0.325, 0.15, 0.285, 0.74))
+    recorded = {record.stage for record in records if len(record.errors())}
+    panels = [(title, stages) for title, stages in COMPARISONS if recorded & set(stages)]
+    for k, (title, stages) in enumerate(panels):
+        axes = figure.add_axes((0.05 + k * 0.965 / len(panels), 0.15, 0.965 / len(panels) - 0.04, 0.74))
         style_axes(axes, theme, title=title, x="reprojection error (px)", y="observations" if k == 0 else "")
         for stage, color in zip(stages, (theme.second, theme.third, theme.first)[-len(stages) :], strict=True):
             errors = errors_of(records, stage)
             if not len(errors):
-                continue
+                continue  # the other stages of the panel are there
             counts, _ = np.histogram(np.clip(errors, bins[0], bins[-1]), bins)
             name = f"{stage}, median {np.median(errors):.2f}"
             axes.stairs(counts, bins, fill=True, color=color, alpha=0.22)
@@ -60,9 +62,8 @@ def error_histograms_figure(records: Sequence[StageRecord], *, theme: Theme = LI
         axes.set_xlim(bins[0], bins[-1])
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.minorticks_off()
-        if axes.get_legend_handles_labels()[0]:
-            axes.set_ylim(0, axes.get_ylim()[1] * 1.28)
-            style_legend(axes, theme, location="upper left")
+        axes.set_ylim(0, axes.get_ylim()[1] * 1.28)
+        style_legend(axes, theme, location="upper left")
     return figure
 
 

@@ -105,7 +105,7 @@ def mapping_figures(
         )
     for section, stages, caption in REFINEMENTS:
         yield from _refinement_figures(run, photo_of, section, stages, caption, options.max_photos)
-    if run.records:
+    if any(len(record.errors()) for record in run.records):
         yield ReportFigure(
             "errors",
             "error-histograms",

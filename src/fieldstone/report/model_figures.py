@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.spatial import KDTree
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
@@ -18,6 +19,7 @@ from fieldstone.report.theme import (
     FONT,
     LIGHT,
     Theme,
+    evenly,
     label,
     mixed,
     new_figure,
@@ -31,6 +33,8 @@ from fieldstone.scene.reconstruction import Reconstruction
 
 MOST_NAMES = 30
 """With more cameras than this, names would cover each other and are left out."""
+MOST_POINTS = 50_000
+"""Of more points than this, evenly chosen ones are drawn: a figure has fewer pixels."""
 HALF_IN = (5.6, 4.6)
 PRIOR_OF_MEAN_UP = 0.01
 """Weight of the mean upward axis, beside the mean square of what the rightward axes have along up."""
@@ -83,9 +87,10 @@ def from_above_figure(model: Reconstruction, *, theme: Theme = LIGHT) -> Figure:
     axes = figure.add_axes((0.11, 0.11, 0.86, 0.86))
     style_axes(axes, theme, x="right (scene units)", y="forward (scene units)")
     plan_from_world = upright_frame(model)
-    points = model.points.xyz @ plan_from_world.T
+    drawn = evenly(len(model.points), MOST_POINTS)
+    points = model.points.xyz[drawn] @ plan_from_world.T
     by_height = np.argsort(points[:, 2], kind="stable")
-    colors = readable_colors(model.points.rgb, theme)
+    colors = readable_colors(model.points.rgb[drawn], theme)
     axes.scatter(*points[by_height, :2].T, s=5, c=colors[by_height], linewidths=0, alpha=0.9, gid="points")
     size = frustum_size(model)
     edges = all_frusta(model, size) @ plan_from_world.T
@@ -101,12 +106,13 @@ def perspective_figure(model: Reconstruction, *, theme: Theme = LIGHT) -> Figure
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set_axis_off()
     eye_from_world = viewpoint(model)
-    points = eye_from_world.apply(model.points.xyz)
+    drawn = evenly(len(model.points), MOST_POINTS)
+    points = eye_from_world.apply(model.points.xyz[drawn])
     visible = np.flatnonzero(points[:, 2] > 0.05 * np.median(points[:, 2]) if len(points) else [])
     far_to_near = visible[np.argsort(-points[visible, 2], kind="stable")]
     pixels = _plane(points[far_to_near])
     nearness = np.median(points[visible, 2]) / points[far_to_near, 2] if len(visible) else np.empty(0)
-    colors = readable_colors(model.points.rgb, theme)[far_to_near]
+    colors = readable_colors(model.points.rgb[drawn], theme)[far_to_near]
     axes.scatter(*pixels.T, s=np.clip(7.0 * nearness**2, 1.5, 40.0), c=colors, linewidths=0, gid="points")
     edges = eye_from_world.apply(all_frusta(model, frustum_size(model)))
     edges = edges[np.all(edges[:, :, 2] > 0, axis=1)]
@@ -133,7 +139,7 @@ def bundle_overlay_figure(before: Reconstruction, after: Reconstruction, *, them
     plan_from_world, size = upright_frame(after), frustum_size(after)
     frusta, points = [], []
     for model, color, name in ((before, theme.second, "before"), (after, theme.first, "after")):
-        points.append(model.points.xyz @ plan_from_world.T)
+        points.append(model.points.xyz[evenly(len(model.points), MOST_POINTS)] @ plan_from_world.T)
         frusta.append((all_frusta(model, size) @ plan_from_world.T)[:, :, :2])
         axes.scatter(*points[-1][:, :2].T, s=4, c=color, linewidths=0, alpha=0.55, gid=f"points-{name}")
         axes.add_collection(
@@ -216,12 +222,13 @@ def viewpoint(model: Reconstruction) -> Rigid3:
 def frustum_size(model: Reconstruction) -> float:
     """Depth to draw camera frusta at: visible beside the scene, but not touching each other."""
     centers, xyz = model.camera_centers(), model.points.xyz
-    distances = [np.median(np.linalg.norm(xyz - c, axis=1)) for c in centers] if len(xyz) else [1.0]
+    some = xyz[evenly(len(xyz), 1000)]
+    distances = [np.median(np.linalg.norm(some - c, axis=1)) for c in centers] if len(some) else [1.0]
     reach = 0.16 * float(np.median(distances)) if len(distances) else 1.0
     if len(centers) < 2:
         return reach
-    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.diag(np.full(len(centers), np.inf))
-    return float(np.clip(0.8 * np.median(apart.min(axis=1)), 0.2 * reach, reach))
+    to_nearest = KDTree(centers).query(centers, k=2)[0][:, 1]
+    return float(np.clip(0.8 * np.median(to_nearest), 0.2 * reach, reach))
 
 
 def all_frusta(model: Reconstruction, size: float) -> Float[np.ndarray, "e 2 3"]:
@@ -293,15 +300,18 @@ def _names(axes: Axes, model: Reconstruction, positions: Float[np.ndarray, "r k"
         return
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
-    on_page = axes.transData.transform(positions[:, :2]) * 72.0 / figure.dpi  # in points
+    points_per_dot = 72.0 / figure.dpi
+    on_page = axes.transData.transform(positions[:, :2]) * points_per_dot
+    left, bottom, right, top = (np.array(axes.bbox.extents) * points_per_dot).tolist()
     taken: list[tuple[float, float, float, float]] = []
-    for view, position, (x, y) in zip(views, positions, on_page, strict=True):
+    for view, position, (x, y) in zip(views, positions, on_page.tolist(), strict=True):
         name = label(model.views[view].name, 16)
         width, height = 0.66 * NAME_PT * len(name), 1.3 * NAME_PT
         for dx, dy in NAME_OFFSETS:
-            box = (x + dx * (12 + width / 2) - width / 2, y + dy * 14 - height / 2)
-            box = (*box, box[0] + width, box[1] + height)
-            if not any(box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken):
+            x0, y0 = x + dx * (12 + width / 2) - width / 2, y + dy * 14 - height / 2
+            box = (x0, y0, x0 + width, y0 + height)
+            is_inside = left <= x0 and box[2] <= right and bottom <= y0 and box[3] <= top
+            if is_inside and not any(_overlap(box, other) for other in taken):
                 break
         else:
             continue
@@ -310,7 +320,12 @@ def _names(axes: Axes, model: Reconstruction, positions: Float[np.ndarray, "r k"
             name, (position[0], position[1]), xytext=(dx * (12 + width / 2), dy * 14), textcoords="offset points",
             ha="center", va="center", color=mixed(theme.first, theme.ink, 0.35), fontsize=NAME_PT, family=FONT,
             parse_math=False, annotation_clip=True, zorder=5, gid="name",
+            arrowprops={"arrowstyle": "-", "color": theme.muted, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1},
         )  # fmt: skip
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def _plane(points_in_eye: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

@@ -120,6 +120,8 @@ def render_page(
         timings=_timings(run, metrics),
         views=_views(metrics),
         truth=_object_of(run.get("truth")),
+        notes=[str(note) for note in _list_of(run.get("notes"))],
+        cameras=[_camera(camera) for camera in _list_of(run.get("cameras")) if isinstance(camera, dict)],
         data_uri=lambda name: _data_uri(folder, name),
     )
 
@@ -146,7 +148,10 @@ def _facts(run: Mapping[str, Any], metrics: Mapping[str, Any], curve: Sequence[A
     summary, facts = _object_of(run.get("summary")), []
     if "registered" in summary:
         share = f"{_number(summary['registered'], 0)} of {_number(summary.get('photos'), 0)}"
-        facts.append(_Fact(share, "photos registered", f"by the {run.get('mapper', 'unknown')} mapper"))
+        parts = [n for n in _list_of(run.get("components")) if _is_number(n)]
+        sizes = " + ".join(_number(n, 0) for n in parts)
+        note = f"in {len(parts)} models: {sizes}" if len(parts) > 1 else f"by the {run.get('mapper', 'unknown')} mapper"
+        facts.append(_Fact(share, "photos registered", note))
     if "points" in summary:
         length = _number(summary.get("mean_track_length"), 2)
         facts.append(_Fact(_number(summary["points"], 0), "points", f"each seen in {length} photos on average"))
@@ -226,13 +231,25 @@ ROW_KEYS = ("stage", "photo", "points", "behind", "mean_px", "median_px", "rms_p
 
 def _rows(value: Any) -> list[dict[str, Any]]:
     """A list of objects, each with every key that the page asks for; anything else is left out."""
-    if not isinstance(value, list):
-        return []
-    return [dict.fromkeys(ROW_KEYS) | row for row in value if isinstance(row, dict)]
+    return [dict.fromkeys(ROW_KEYS) | row for row in _list_of(value) if isinstance(row, dict)]
 
 
 def _object_of(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
+
+
+def _list_of(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _camera(camera: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Model, size in pixels and parameters of a camera."""
+    size = f"{_number(camera.get('width'), 0)} × {_number(camera.get('height'), 0)}"
+    return (
+        str(camera.get("model", "–")),
+        size,
+        ", ".join(f"{p:.6g}" for p in _list_of(camera.get("params")) if _is_number(p)),
+    )
 
 
 def _timings(run: Mapping[str, Any], metrics: Mapping[str, Any]) -> list[tuple[str, float]]:
