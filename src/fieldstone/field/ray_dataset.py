@@ -215,10 +215,9 @@ def split_every(names: list[str], every: int = TEST_EVERY) -> tuple[list[int], l
     return [i for i in order if i not in set(test)], test
 
 
-def blender_frame() -> FieldFrame:
-    """The frame of the Blender scenes: their own coordinates, rays from 2 to 6, a white background."""
-    identity = Sim3(1.0, np.eye(3), np.zeros(3))
-    return FieldFrame(identity, BLENDER_NEAR, BLENDER_FAR, np.array(WHITE))
+def blender_frame(near: float = BLENDER_NEAR, far: float = BLENDER_FAR) -> FieldFrame:
+    """The frame of the Blender scenes: their own coordinates, on white."""
+    return FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), near, far, np.array(WHITE))
 
 
 def frame_from_points(model: Reconstruction, background: Float[np.ndarray, "3"]) -> FieldFrame:

@@ -81,22 +81,23 @@ def orbit(cam_from_world: Rigid3, num_frames: int) -> Rigid3:
 
 
 def spiral(cam_from_world: Rigid3, num_frames: int, *, turns: int = 2) -> Rigid3:
-    """Loops about the mean camera while looking at what the photos look at: for scenes seen from one side.
+    """Loops about the photo in the middle while looking at what the photos look at: for scenes seen from one side.
 
-    The loops reach as far as the photos spread (one standard deviation) along the mean camera's axes.
+    The loops reach as far as the photos spread along that photo's axes (one standard deviation), at least 2 % and at
+    most 15 % of the distance to the scene.
 
     Source:
         The render path of `mildenhall2020` for forward-facing scenes, from poses alone.
     """
     centers = cam_from_world.target_origin_in_source()
-    focus, up = focus_point(cam_from_world), up_direction(cam_from_world)
-    middle = look_at(centers.mean(axis=0), focus, up)
-    spread = middle.apply(centers).std(axis=0)
+    focus = focus_point(cam_from_world)
+    middle = cam_from_world[int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))]
+    up = -middle.R[1]
+    distance = float(np.linalg.norm(focus - middle.target_origin_in_source()))
+    reach = np.clip(middle.apply(centers).std(axis=0), 0.02 * distance, 0.15 * distance)
     phase = 2 * np.pi * np.arange(num_frames) / num_frames
-    offsets_in_middle = np.stack(
-        [np.cos(turns * phase), np.sin(turns * phase), 0.5 * np.sin(phase)], axis=1
-    ) * np.maximum(spread, 0.02 * np.linalg.norm(focus - centers.mean(axis=0)))
-    path = middle.inverse().apply(offsets_in_middle)
+    loops = np.stack([np.cos(turns * phase), np.sin(turns * phase), 0.5 * np.sin(phase)], axis=1)
+    path = middle.inverse().apply(loops * reach)
     return Rigid3.stack([look_at(center, focus, up) for center in path])
 
 

@@ -1,0 +1,91 @@
+"""A trained field to a film or to images along a camera path."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import quantize
+from fieldstone.field.radiance_field import in_world
+from fieldstone.field.training import TrainOptions
+from fieldstone.geometry.camera import Camera, rescale
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.checkpoint import read_checkpoint
+from fieldstone.io.photos import write_photo
+from fieldstone.io.video import write_gif, write_mp4
+from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
+from fieldstone.render.camera_paths import orbit, spiral, through
+from fieldstone.render.views import render_view
+
+PathName = Literal["orbit", "spiral", "through"]
+FilmFormat = Literal["mp4", "gif", "png"]
+
+PATHS: dict[str, Callable[[Rigid3, int], Rigid3]] = {"orbit": orbit, "spiral": spiral, "through": through}
+
+
+def render_run(
+    out: Path,
+    *,
+    path: PathName = "orbit",
+    fmt: FilmFormat = "mp4",
+    frames: int = 120,
+    fps: int = 30,
+    size_px: int | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """Render a film of the field that `train_run` left in `out`.
+
+    Args:
+        path: orbit: around what the photos look at. spiral: loops about their mean. through: from photo to photo.
+        fmt: mp4 and gif give one file, png a folder of numbered images.
+        size_px: Longer side of the images; None: as trained.
+        on_frame: Called with the number of frames done and of all.
+
+    Returns:
+        The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/.
+
+    Raises:
+        InputError: No usable checkpoint in `out`.
+    """
+    if frames < 1 or fps < 1 or (size_px is not None and size_px < 1):
+        raise InputError(f"frames, fps and size must be at least 1, got {frames}, {fps}, {size_px}")
+    tensors, header = read_checkpoint(out / CHECKPOINT)
+    poses, state_tensors = split_tensors(tensors)
+    frame = frame_from_header(header)
+    camera = _camera(header["cameras"][0], size_px)
+    poses_on_path = PATHS[path](poses, frames)
+    options = TrainOptions(**header["options"])
+    threads = threads or os.cpu_count() or 1
+    with open_training(options, frame, None, seed=header["seed"], device=device, threads=threads) as training:
+        render_rays = in_world(training.renderer(training.from_tensors(state_tensors)), frame)
+
+        def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+            for k in range(frames):
+                yield quantize(render_view(render_rays, camera, poses_on_path[k]).rgb)
+                on_frame(k + 1, frames)
+
+        target = out / "renders" / (path if fmt == "png" else f"{path}.{fmt}")
+        if fmt == "mp4":
+            write_mp4(target, images(), fps=fps)
+        elif fmt == "gif":
+            write_gif(target, images(), fps=fps)
+        else:
+            for k, image in enumerate(images()):
+                write_photo(target / f"{k:04d}.png", image)
+    return target
+
+
+def _camera(stored: dict, size_px: int | None) -> Camera:
+    camera = Camera(stored["model"], stored["width"], stored["height"], np.array(stored["params"]))
+    if size_px is None:
+        return camera
+    factor = size_px / max(camera.width, camera.height)
+    return rescale(camera, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))

@@ -1,0 +1,247 @@
+"""Posed photos to a trained field: dataset, training with checkpoints, held-out views and their metrics.
+
+What a run leaves in its folder: `checkpoint.safetensors` (all that rendering and resuming need), `curve.json`,
+`metrics.json` and `renders/test/NAME.png`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fieldstone import __version__
+from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import PROTOCOL, psnr, quantize, ssim
+from fieldstone.field.radiance_field import FieldFrame, FieldTraining, RayRenderer, in_world
+from fieldstone.field.ray_dataset import PosedImage, RayDataset, training_rays
+from fieldstone.field.training import PRESETS, CurvePoint, OnStep, TrainOptions, train
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.sim3 import Sim3
+from fieldstone.io.atomic import write_json
+from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.photos import write_photo
+from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
+from fieldstone.render.views import render_view
+
+logger = logging.getLogger(__name__)
+
+FieldName = Literal["tiny", "nerf"]
+
+CHECKPOINT, CURVE, METRICS = "checkpoint.safetensors", "curve.json", "metrics.json"
+
+MAX_PSNR = 100.0
+"""What an image that is equal at 8 bits counts as, in dB: JSON has no infinity."""
+
+OnStage = Callable[[str], None]
+
+
+def train_run(
+    source: Path,
+    out: Path,
+    *,
+    field: FieldName = "tiny",
+    budget_s: float | None = 300.0,
+    max_steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    threads: int | None = None,
+    photos: Path | None = None,
+    on_step: OnStep = lambda point: None,
+    on_stage: OnStage = lambda stage: None,
+) -> dict[str, Any]:
+    """Train a field on posed photos, render the held-out ones and measure them.
+
+    If `out` holds a checkpoint of the same field, photos and seed, training goes on from it, to the same result as
+    without the stop.
+
+    Args:
+        source: A Blender-format folder, or one that `reconstruct` wrote.
+        budget_s: Seconds of training in all, those before a stop included; None: no limit.
+        max_steps: Steps in all; None: no limit.
+        threads: None: one per processor.
+        photos: Folder with the photos of a reconstruction, if they are not where they were.
+
+    Returns:
+        What `metrics.json` holds.
+
+    Raises:
+        InputError: The source cannot be used, or `out` holds another field.
+    """
+    on_stage("reading photos")
+    options = PRESETS[field]
+    dataset = read_ray_dataset(source, photos, options.image_size_px)
+    header = run_header(field, options, seed, dataset)
+    threads = threads or os.cpu_count() or 1
+    with open_training(options, dataset.frame, dataset, seed=seed, device=device, threads=threads) as training:
+        state, curve = _resume_or_start(training, out, header)
+        on_stage("training")
+        views = scene_tensors(dataset.train)
+
+        def save(state: Any, curve: tuple[CurvePoint, ...]) -> None:
+            # The curve first: after a stop between the two it holds steps too many, which are dropped.
+            write_json(out / CURVE, [asdict(point) for point in curve])
+            write_checkpoint(out / CHECKPOINT, {**views, **_prefixed(training.to_tensors(state))}, header)
+
+        state, curve = train(
+            training, state, budget_s=budget_s, max_steps=max_steps, curve=curve, on_step=on_step, save=save
+        )
+        on_stage("rendering held-out views")
+        render_rays = in_world(training.renderer(state), dataset.frame)
+        metrics = evaluate_views(render_rays, dataset, out / "renders" / "test")
+    metrics |= {
+        "seconds": curve[-1].seconds if curve else 0.0,
+        "steps": len(curve),
+        "field": field,
+        "device": device,
+        "threads": threads,
+        "seed": seed,
+        "version": __version__,
+    }
+    write_json(out / METRICS, metrics)
+    return metrics
+
+
+@contextmanager
+def open_training(
+    options: TrainOptions, frame: FieldFrame, dataset: RayDataset | None, *, seed: int, device: str, threads: int
+) -> Iterator[FieldTraining[Any]]:
+    """The training of a field, with its worker threads; without a dataset it can only render.
+
+    Raises:
+        InputError: torch is not installed, or the device is not there.
+    """
+    try:
+        from fieldstone.field.torch_training import TorchTraining, torch_device, torch_workers
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise InputError(
+            f"the {options.network} network needs torch: pip install 'fieldstone[torch]' "
+            "(without a GPU, from the index https://download.pytorch.org/whl/cpu)"
+        ) from error
+    rays = None if dataset is None else training_rays(dataset.train, frame)
+    with torch_workers(threads) as workers:
+        yield TorchTraining(options, frame, rays, seed, torch_device(device), workers)
+
+
+def evaluate_views(render_rays: RayRenderer, dataset: RayDataset, folder: Path) -> dict[str, Any]:
+    """Render every held-out view to `folder`/NAME.png, and compare it with its photo."""
+    views: dict[str, dict[str, float]] = {}
+    labels = view_labels([image.name for image in dataset.test])
+    for label, image in zip(labels, dataset.test, strict=True):
+        rendered = quantize(render_view(render_rays, image.camera, image.cam_from_world).rgb)
+        write_photo(folder / f"{label}.png", rendered)
+        photo = image.composited(dataset.frame.background)
+        as_written = rendered.astype(np.float32) / np.float32(255.0)
+        views[label] = {"psnr": min(psnr(as_written, photo), MAX_PSNR), "ssim": ssim(as_written, photo)}
+    sizes = sorted({(image.camera.width, image.camera.height) for image in dataset.test})
+    background = ", ".join(f"{255 * c:.0f}" for c in dataset.frame.background)
+    return {
+        "psnr": float(np.mean([view["psnr"] for view in views.values()])) if views else None,
+        "ssim": float(np.mean([view["ssim"] for view in views.values()])) if views else None,
+        "views": views,
+        "protocol": (
+            f"{len(views)} held-out views of {' and '.join(f'{w}x{h}' for w, h in sizes) or 'no'} pixels; "
+            f"background ({background}); {PROTOCOL}; equal images count as {MAX_PSNR:.0f} dB"
+        ),
+    }
+
+
+def run_header(field: str, options: TrainOptions, seed: int, dataset: RayDataset) -> dict[str, Any]:
+    """What a checkpoint says of its run; equal headers mean that training can go on."""
+    frame = dataset.frame
+    cameras: list[Camera] = []
+    camera_of_view = []
+    for image in dataset.train:
+        if not any(image.camera is camera for camera in cameras):
+            cameras.append(image.camera)
+        camera_of_view.append(next(k for k, camera in enumerate(cameras) if camera is image.camera))
+    return {
+        "field": field,
+        "options": asdict(options),
+        "seed": seed,
+        "photos": fingerprint(dataset),
+        "frame": {
+            "scale": frame.normalized_from_world.scale,
+            "R": frame.normalized_from_world.R.tolist(),
+            "t": frame.normalized_from_world.t.tolist(),
+            "near": frame.near,
+            "far": frame.far,
+            "background": frame.background.tolist(),
+        },
+        "names": [image.name for image in dataset.train],
+        "cameras": [
+            {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in cameras
+        ],
+        "camera_of_view": camera_of_view,
+    }
+
+
+def fingerprint(dataset: RayDataset) -> str:
+    """SHA-256 of the training photos as they are used, with names and poses."""
+    digest = hashlib.sha256()
+    for image in dataset.train:
+        digest.update(f"{image.name}\n{image.pixels.shape}\n".encode())
+        for array in (image.pixels, image.camera.params, image.cam_from_world.R, image.cam_from_world.t):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def scene_tensors(images: tuple[PosedImage, ...]) -> dict[str, np.ndarray]:
+    """Poses of the training views, for camera paths."""
+    poses = Rigid3.stack([image.cam_from_world for image in images])
+    return {"views.R": poses.R, "views.t": poses.t}
+
+
+def frame_from_header(header: Mapping[str, Any]) -> FieldFrame:
+    """The frame of a checkpoint."""
+    frame = header["frame"]
+    sim3 = Sim3(frame["scale"], np.array(frame["R"]), np.array(frame["t"]))
+    return FieldFrame(sim3, frame["near"], frame["far"], np.array(frame["background"]))
+
+
+def split_tensors(tensors: Mapping[str, np.ndarray]) -> tuple[Rigid3, dict[str, np.ndarray]]:
+    """Poses of the training views, and the state of the field, of a checkpoint."""
+    state = {name.removeprefix("state."): array for name, array in tensors.items() if name.startswith("state.")}
+    return Rigid3(tensors["views.R"], tensors["views.t"]), state
+
+
+def _prefixed(tensors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"state.{name}": array for name, array in tensors.items()}
+
+
+def _resume_or_start(
+    training: FieldTraining[Any], out: Path, header: Mapping[str, Any]
+) -> tuple[Any, tuple[CurvePoint, ...]]:
+    if not (out / CHECKPOINT).exists():
+        return training.start(), ()
+    tensors, found = read_checkpoint(out / CHECKPOINT)
+    other = [key for key in header if found.get(key) != header[key]]
+    if other:
+        raise InputError(
+            f"{out}: holds a field of another run (differs in: {', '.join(other)}); choose another output folder"
+        )
+    _, state_tensors = split_tensors(tensors)
+    state = training.from_tensors(state_tensors)
+    curve = _read_curve(out / CURVE)[: int(state_tensors["step"])]
+    if len(curve) < int(state_tensors["step"]):
+        raise InputError(f"{out / CURVE}: holds fewer steps than the checkpoint; train into a new folder")
+    logger.info("going on after step %d, %.1f s", len(curve), curve[-1].seconds if curve else 0.0)
+    return state, curve
+
+
+def _read_curve(path: Path) -> tuple[CurvePoint, ...]:
+    try:
+        return tuple(CurvePoint(**point) for point in json.loads(path.read_text()))
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: missing or damaged training curve ({error}); train into a new folder") from error

@@ -1,0 +1,265 @@
+"""The verbs `train` and `render`, on a ball that is cheap to photograph and to learn."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import psnr, ssim
+from fieldstone.field.training import PRESETS, TINY
+from fieldstone.geometry.camera import Camera
+from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.colmap import write_colmap
+from fieldstone.io.photos import read_photo, write_photo
+from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
+from fieldstone.pipeline.field_render import render_run
+from fieldstone.pipeline.fields import train_run
+from fieldstone.render.camera_paths import look_at
+from fieldstone.scene.rays import rays_from_view
+from fieldstone.scene.reconstruction import Points, Reconstruction, View
+from fieldstone.scene.tracks import Observations
+
+CAMERA = Camera("SIMPLE_PINHOLE", 20, 16, np.array([24.0, 10.0, 8.0]))
+
+
+def ball_photo(pose, *, center=(0.0, 0.0, 0.0), radius=1.0):
+    """RGBA of a ball coloured by its normal."""
+    rays = rays_from_view(CAMERA, pose)
+    origins = rays.origins - center
+    b = np.sum(origins * rays.directions, axis=1)
+    discriminant = b**2 - np.sum(origins**2, axis=1) + radius**2
+    normals = (origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions) / radius
+    rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
+    return np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8).reshape(16, 20, 4)
+
+
+def ring(n, radius=4.0, center=(0.0, 0.0, 0.0)):
+    up = np.array([0.0, 0, 1])
+    for angle in 2 * np.pi * np.arange(n) / n:
+        position = np.array(center) + radius * np.array([np.cos(angle), np.sin(angle), 0.3])
+        yield look_at(position, np.array(center), up)
+
+
+def write_blender_folder(folder):
+    for split, n in (("train", 6), ("test", 2)):
+        frames = []
+        for k, pose in enumerate(ring(n)):
+            name = f"./{split}/r_{k}"
+            write_photo(folder / f"{name}.png", ball_photo(pose))
+            world_from_cam = pose.inverse()
+            matrix = np.eye(4)
+            matrix[:3, :3] = world_from_cam.R @ np.diag([1, -1, -1])
+            matrix[:3, 3] = world_from_cam.t
+            frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+        content = {"camera_angle_x": float(2 * np.arctan(10 / 24)), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_colmap_folder(folder, photos, n=9):
+    """A model of a ball of radius 3 at (10, 0, 0), with points on the ball, and its photos in another folder."""
+    center = np.array([10.0, 0, 0])
+    poses = list(ring(n, radius=12.0, center=center))
+    points = center + 3.0 * np.random.default_rng(0).standard_normal((40, 3)) / np.sqrt(3)
+    views = tuple(View(f"p{k}.png", 0, pose) for k, pose in enumerate(poses))
+    point = np.repeat(np.arange(40), n)
+    view = np.tile(np.arange(n), 40)
+    observations = Observations(view, point.copy(), point, np.zeros((40 * n, 2)))
+    model = Reconstruction((CAMERA,), views, Points(points, np.zeros((40, 3), dtype=np.uint8)), observations)
+    write_colmap(model, folder / "sparse" / "0")
+    for v in views:
+        write_photo(photos / v.name, ball_photo(v.cam_from_world, center=center, radius=3.0)[..., :3])
+    return folder
+
+
+@pytest.fixture
+def small_tiny(monkeypatch):
+    """The preset `tiny`, small enough for a test."""
+    options = replace(TINY, width=16, position_frequencies=3, direction_frequencies=1, num_samples=8)
+    monkeypatch.setitem(PRESETS, "tiny", options)
+
+
+pytestmark = pytest.mark.usefixtures("small_tiny")
+
+
+def test_train_on_a_blender_folder(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    stages = []
+    metrics = train_run(source, out, budget_s=None, max_steps=60, threads=1, on_stage=stages.append)
+    assert metrics == json.loads((out / "metrics.json").read_text())
+    assert stages == ["reading photos", "training", "rendering held-out views"]
+    assert set(metrics["views"]) == {"r_0", "r_1"}
+    assert metrics["steps"] == 60
+    assert "8-bit" in metrics["protocol"]
+    assert "2 held-out views of 20x16 pixels" in metrics["protocol"]
+    # The numbers are those of the written images against the photos on white.
+    for name, view in metrics["views"].items():
+        rendered = read_photo(out / "renders" / "test" / f"{name}.png").rgb / 255.0
+        given = read_photo(source / "test" / f"{name}.png")
+        assert given.alpha is not None
+        alpha = given.alpha[..., None] / 255.0
+        photo = given.rgb / 255.0 * alpha + 1 - alpha
+        assert view["psnr"] == pytest.approx(psnr(rendered, photo), rel=1e-9)
+        assert view["ssim"] == pytest.approx(ssim(rendered, photo), rel=1e-9)
+    for key in ("psnr", "ssim"):
+        assert metrics[key] == pytest.approx(np.mean([view[key] for view in metrics["views"].values()]))
+    assert metrics["psnr"] > 16
+    curve = json.loads((out / "curve.json").read_text())
+    assert [point["step"] for point in curve] == list(range(1, 61))
+    assert set(curve[0]) == {"step", "seconds", "loss", "psnr"}
+    assert curve[-1]["psnr"] > curve[0]["psnr"]
+    assert metrics["seconds"] == curve[-1]["seconds"]
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path):
+    pytest.importorskip("torch")
+    source = write_blender_folder(tmp_path / "in")
+    train_run(source, tmp_path / "whole", budget_s=None, max_steps=7, threads=1)
+
+    class Killed(BaseException):
+        pass
+
+    def kill_at_five(point):
+        if point.step == 5:
+            raise Killed
+
+    train_run(source, tmp_path / "parts", budget_s=None, max_steps=3, threads=2)
+    with pytest.raises(Killed):
+        train_run(source, tmp_path / "parts", budget_s=None, max_steps=7, threads=1, on_step=kill_at_five)
+    train_run(source, tmp_path / "parts", budget_s=None, max_steps=7, threads=1)
+    name = "checkpoint.safetensors"
+    assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    whole, parts = (json.loads((tmp_path / run / "curve.json").read_text()) for run in ("whole", "parts"))
+    assert [(p["step"], p["loss"]) for p in parts] == [(p["step"], p["loss"]) for p in whole]
+
+
+def test_an_interrupted_run_keeps_its_steps(tmp_path):
+    pytest.importorskip("torch")
+    source = write_blender_folder(tmp_path / "in")
+
+    def interrupt_at_two(point):
+        if point.step == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_run(source, tmp_path / "out", budget_s=None, max_steps=7, threads=1, on_step=interrupt_at_two)
+    tensors, _ = read_checkpoint(tmp_path / "out" / "checkpoint.safetensors")
+    assert tensors["state.step"] == 2
+
+
+def test_the_budget_counts_earlier_runs(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    first = train_run(source, out, budget_s=0.2, threads=1)
+    assert first["seconds"] >= 0.2
+    again = train_run(source, out, budget_s=0.2, threads=1)
+    assert again["steps"] == first["steps"]
+    assert train_run(source, out, budget_s=first["seconds"] + 0.1, threads=1)["steps"] > first["steps"]
+
+
+def test_another_run_in_the_same_folder_is_refused(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    train_run(source, out, budget_s=None, max_steps=1, threads=1)
+    with pytest.raises(InputError, match="differs in: seed"):
+        train_run(source, out, budget_s=None, max_steps=2, seed=1, threads=1)
+    photo = next((source / "train").iterdir())
+    write_photo(photo, np.zeros((16, 20, 4), dtype=np.uint8))
+    with pytest.raises(InputError, match="differs in: photos"):
+        train_run(source, out, budget_s=None, max_steps=2, threads=1)
+
+
+def test_damaged_checkpoints_are_refused_and_kept(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    train_run(source, out, budget_s=None, max_steps=2, threads=1)
+    path = out / "checkpoint.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    for run in (lambda: train_run(source, out, budget_s=None, max_steps=3, threads=1), lambda: render_run(out)):
+        with pytest.raises(InputError, match="damaged or truncated checkpoint"):
+            run()
+    assert path.read_bytes() == whole[: len(whole) // 2]
+    path.write_bytes(whole)
+    (out / "curve.json").write_text("[{]")
+    with pytest.raises(InputError, match=r"curve\.json"):
+        train_run(source, out, budget_s=None, max_steps=3, threads=1)
+
+
+def test_train_on_a_reconstruction(tmp_path):
+    pytest.importorskip("torch")
+    source = write_colmap_folder(tmp_path / "in", tmp_path / "photos")
+    (source / "run.json").write_text(json.dumps({"photos_folder": "../photos"}))
+    metrics = train_run(source, tmp_path / "out", budget_s=None, max_steps=2, threads=1)
+    # Nine photos by name: numbers 0 and 8 are held out.
+    assert set(metrics["views"]) == {"p0", "p8"}
+    tensors, _ = read_checkpoint(tmp_path / "out" / "checkpoint.safetensors")
+    assert tensors["views.R"].shape == (7, 3, 3)
+    film = render_run(tmp_path / "out", path="through", fmt="gif", frames=3, threads=1)
+    assert film == tmp_path / "out" / "renders" / "through.gif"
+
+
+def test_dataset_of_a_reconstruction(tmp_path):
+    source, photos = write_colmap_folder(tmp_path / "in", tmp_path / "photos"), tmp_path / "photos"
+    with pytest.raises(InputError, match="--photos"):
+        read_ray_dataset(source, None, 100)
+    (photos / "p3.png").unlink()
+    (photos / "p4.png").write_bytes(b"no photo")
+    dataset = read_ray_dataset(source, photos, 100)
+    assert [image.name for image in dataset.train] == ["p1.png", "p2.png", "p5.png", "p6.png", "p7.png", "p8.png"]
+    assert len(dataset.points_in_world) == 40
+    # The ball has radius 3 and the cameras are 12.5 away: its front is within the range of the rays.
+    scale = dataset.frame.normalized_from_world.scale
+    assert dataset.frame.near / scale < 9.5
+    assert dataset.frame.far / scale > 15.5
+    for path in photos.iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="none of the 9 photos"):
+        read_ray_dataset(source, photos, 100)
+
+
+def test_folders_without_posed_photos_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no posed photos"):
+        read_ray_dataset(tmp_path, None, 100)
+    source = write_blender_folder(tmp_path / "in")
+    with pytest.raises(InputError, match="smaller than 11 pixels"):
+        read_ray_dataset(source, None, 12)
+
+
+def test_render_formats(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    train_run(source, out, budget_s=None, max_steps=2, threads=1)
+    done = []
+    film = render_run(out, frames=4, threads=1, on_frame=lambda k, n: done.append((k, n)))
+    assert film.name == "orbit.mp4"
+    assert done == [(k, 4) for k in range(1, 5)]
+    folder = render_run(out, path="spiral", fmt="png", frames=2, size_px=40, threads=1)
+    assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png"]
+    assert read_photo(folder / "0000.png").rgb.shape == (32, 40, 3)
+    with pytest.raises(InputError, match="at least 1"):
+        render_run(out, frames=0)
+    with pytest.raises(InputError, match="fieldstone train"):
+        render_run(tmp_path)
+
+
+def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
+    pytest.importorskip("torch")
+    source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
+    train_run(source, out, budget_s=None, max_steps=1, threads=1)
+    path = out / "checkpoint.safetensors"
+    tensors, header = read_checkpoint(path)
+    del tensors["state.parameters"]
+    write_checkpoint(path, tensors, header)
+    with pytest.raises(InputError, match="parameters"):
+        render_run(out, frames=1, threads=1)
+
+
+def test_labels_of_views():
+    assert view_labels(["test/r_0", "test/r_10.png"]) == ["r_0", "r_10"]
+    assert view_labels(["a/x.jpg", "b/x.jpg"]) == ["a/x", "b/x"]
+    assert view_labels(["x.jpg", "x.png", "y.png"]) == ["x.jpg", "x.png", "y"]
+    assert view_labels([]) == []
