@@ -108,7 +108,129 @@ def _matching_options(
     )
 
 
-VERBS = {"reconstruct": reconstruct}
+def train(
+    source: Source,
+    /,
+    out: Out,
+    *,
+    field: Literal["tiny", "nerf"] = "tiny",
+    budget: str = "300s",
+    steps: int | None = None,
+    photos: Path | None = None,
+    device: str = "cpu",
+    threads: int = 0,
+    seed: int = 0,
+) -> int:
+    """A radiance field from posed photos, and its held-out views measured. Run it again to go on after a stop.
+
+    Args:
+        source: Folder in the Blender format (transforms_train.json), or one that `reconstruct` wrote.
+        out: Folder for the result: checkpoint.safetensors, metrics.json, curve.json, renders/test.
+        field: tiny is the small network of the course at 100x100, nerf the original NeRF at 400x400.
+        budget: Time for training in all, what earlier runs in this folder took included: 300s, 10m, 2h.
+        steps: Stop after so many steps in all, if the budget lasts.
+        photos: Folder with the photos of a reconstruction, if they are not where they were.
+        device: cpu, cuda, mps.
+        threads: 0 takes all cores. The result is the same for any number.
+        seed: Every random number of the run follows from it.
+    """
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from fieldstone.pipeline.fields import train_run
+
+    budget_s = _seconds(budget)
+    console = _console()
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]}"))
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("reading", total=budget_s, found="")
+        metrics = train_run(
+            source,
+            out,
+            field=field,
+            budget_s=budget_s,
+            max_steps=steps,
+            seed=seed,
+            device=device,
+            threads=threads or None,
+            photos=photos,
+            on_step=lambda p: progress.update(
+                task, completed=p.seconds, found=f"step {p.step}, training PSNR {p.psnr:.2f} dB"
+            ),
+            on_stage=lambda stage: progress.update(task, description=stage),
+        )
+    done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"
+    if metrics["psnr"] is None:
+        console.print(f"{done}; no photo was held out, so nothing is measured -> {out}", markup=False)
+    else:
+        console.print(
+            f"{done}; {len(metrics['views'])} held-out views: PSNR {metrics['psnr']:.2f} dB, "
+            f"SSIM {metrics['ssim']:.3f} -> {out}",
+            markup=False,
+        )
+    return 0
+
+
+def render(
+    source: Source,
+    /,
+    *,
+    path: Literal["orbit", "spiral", "through"] = "orbit",
+    format: Literal["mp4", "gif", "png"] = "mp4",
+    frames: int = 120,
+    fps: int = 30,
+    size: int | None = None,
+    device: str = "cpu",
+    threads: int = 0,
+) -> int:
+    """A film of a trained field.
+
+    Args:
+        source: Folder that `train` wrote; the film goes to its folder renders.
+        path: orbit goes around what the photos look at, spiral loops near their middle, through goes from one to
+            the next.
+        format: mp4 and gif give one file, png a folder of images.
+        frames: Number of images.
+        fps: Images per second.
+        size: Longer side in pixels; by default as trained.
+        device: cpu, cuda, mps.
+        threads: 0 takes all cores.
+    """
+    from rich.progress import Progress
+
+    from fieldstone.pipeline.field_render import render_run
+
+    console = _console()
+    with Progress(console=console) as progress:
+        task = progress.add_task("rendering", total=frames)
+        target = render_run(
+            source,
+            path=path,
+            fmt=format,
+            frames=frames,
+            fps=fps,
+            size_px=size,
+            device=device,
+            threads=threads or None,
+            on_frame=lambda done, total: progress.update(task, completed=done),
+        )
+    console.print(f"{frames} images -> {target}", markup=False)
+    return 0
+
+
+def _seconds(text: str) -> float:
+    """A time such as 300s, 10m, 1.5h, or a plain number of seconds."""
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds < float("inf"):
+        raise InputError(f"--budget {text}: give a positive time such as 300s, 10m or 2h")
+    return seconds
+
+
+VERBS = {"reconstruct": reconstruct, "train": train, "render": render}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

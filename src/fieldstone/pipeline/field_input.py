@@ -97,7 +97,9 @@ def _colmap_dataset(source: Path, photos: Path | None, image_size_px: int) -> Ra
     for i in model.registered().tolist():
         view = model.views[i]
         try:
-            images.append(PosedImage(view.name, model.camera_of(i), model.pose_of(i), pixels_of(read_photo(folder / view.name))))
+            images.append(
+                PosedImage(view.name, model.camera_of(i), model.pose_of(i), pixels_of(read_photo(folder / view.name)))
+            )
         except InputError as error:
             logger.warning("skipped %s", error)
     if not images:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -81,6 +82,8 @@ def reconstruct(
     write_figures(out / "figures", "mapping", mapping_figures(run, material.photos.get), small)
     seconds["writing"] = time.perf_counter() - start
     record = run_record(source, mapper, run, material, options.seed, seconds)
+    # Relative, so that the two folders may move together.
+    record["photos_folder"] = Path(os.path.relpath(source.resolve(), out.resolve())).as_posix()
     write_json(out / "run.json", record)
     write_report(out)
     return record
