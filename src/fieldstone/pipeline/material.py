@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.features.matching import MutualRatio
-from fieldstone.features.pairs import exhaustive
+from fieldstone.features.pairs import PairOptions, choose_pairs
 from fieldstone.features.sift import Sift, SiftOptions
 from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.matching_txt import read_course_folder
-from fieldstone.io.photos import Photo, PhotoProblem, list_photos, read_photos
+from fieldstone.io.photos import PhotoInfo, PhotoProblem, list_photos, read_photo
 from fieldstone.scene.features import Features
-from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.solve.two_view import TwoViewOptions
 
@@ -30,10 +31,13 @@ logger = logging.getLogger(__name__)
 
 GUESSED_FOCAL = 1.2
 """Focal length over the longer side where nothing else is known of it."""
+EARTH_RADIUS_M = 6.371e6
 MIN_VOTE_CONTRAST = 0.1
 """A vote on the focal length that is flatter than this says nothing."""
 
 OnStage = Callable[[str], None]
+PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
+"""Decodes the photo of that name; None if there is none."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class MatchingOptions:
     sift: SiftOptions = field(default_factory=SiftOptions)
     max_ratio: float = 0.8
     """Ratio test of the matcher."""
+    pairs: PairOptions = field(default_factory=PairOptions)
+    """Which pairs of photos are matched."""
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     camera_model: str | None = None
     """Model of given intrinsics; None: PINHOLE for four numbers, SIMPLE_PINHOLE for three."""
@@ -69,7 +75,7 @@ class Material:
     camera_of_image: Int[np.ndarray, "n"]
     known: Bool[np.ndarray, "c"]
     """Cameras whose intrinsics are exact."""
-    photos: Mapping[str, UInt8[np.ndarray, "h w 3"]]
+    photo_of: PhotoByName
     problems: tuple[PhotoProblem, ...]
     seconds: Mapping[str, float]
     sizes: tuple[tuple[int, int], ...]
@@ -91,15 +97,14 @@ def read_course(folder: Path) -> Material:
     """Given matches and calibration, and the photos for colours and figures where they are there."""
     start = time.perf_counter()
     course = read_course_folder(folder)
-    decoded, problems = read_photos([path for path in course.photos if path is not None])
     camera = course.camera
     return Material(
         graph=course.graph,
         cameras=(camera,),
         camera_of_image=np.zeros(course.graph.num_images, dtype=np.int64),
         known=np.array([True]),
-        photos={photo.info.path.name: photo.rgb for photo in decoded},
-        problems=(*course.problems, *problems),
+        photo_of=photos_on_disk([path for path in course.photos if path is not None]),
+        problems=course.problems,
         seconds={"reading": time.perf_counter() - start},
         sizes=((camera.width, camera.height),),
     )
@@ -111,51 +116,88 @@ def match_photos(folder: Path, options: MatchingOptions, seed: int, on_stage: On
     Raises:
         InputError: Fewer than two photos can be read.
     """
-    on_stage("reading photos")
+    on_stage("finding features")
     stop, seconds = _stopwatch()
-    photos, problems = read_photos(list_photos(folder))
+    found, problems = detect(list_photos(folder), options)
     for problem in problems:
         logger.warning("skipped %s: %s", problem.path.name, problem.reason)
-    if len(photos) < 2:
-        found = "".join(f"; {problem.path.name}: {problem.reason}" for problem in problems[:3])
+    if len(found) < 2:
+        reasons = "".join(f"; {problem.path.name}: {problem.reason}" for problem in problems[:3])
         raise InputError(
-            f"{folder}: a reconstruction needs at least two readable photos, found {len(photos)}{found}; add photos"
+            f"{folder}: a reconstruction needs at least two readable photos, found {len(found)}{reasons}; add photos"
         )
-    stop("reading")
-    on_stage("finding features")
-    features = extract([photo.rgb for photo in photos], options)
+    infos, features = [info for info, _ in found], [features for _, features in found]
     stop("features")
     on_stage("matching")
-    cameras, camera_of_image, source = cameras_of_photos(photos, options)
+    cameras, camera_of_image, source = cameras_of_photos(infos, options)
     sizes = tuple((camera.width, camera.height) for camera in cameras)
     working = tuple(_reduced(camera, options.sift.max_image_size) for camera in cameras)
     keypoints = [
         f.keypoints * (np.array([working[c].width, working[c].height]) / sizes[c])
         for f, c in zip(features, camera_of_image.tolist(), strict=True)
     ]
-    graph = match_features([photo.info.path.name for photo in photos], features, keypoints, options)
+    pairs = choose_pairs(
+        features,
+        options.pairs,
+        np.random.default_rng([seed, len(features)]),
+        positions=gps_positions(infos),
+        threads=options.threads,
+    )
+    graph = match_features([info.path.name for info in infos], features, keypoints, pairs, options)
     stop("matching")
     on_stage("verifying pairs")
     working = vote_on_unknown(graph, working, camera_of_image, source, options, seed)
     graph = verify_pairs(graph, working, camera_of_image, options.two_view, seed, options.threads)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
-    images = {photo.info.path.name: photo.rgb for photo in photos}
-    return Material(graph, working, camera_of_image, known, images, tuple(problems), seconds, sizes)
+    photo_of = photos_on_disk([info.path for info in infos])
+    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes)
 
 
-def extract(images: Sequence[UInt8[np.ndarray, "h w 3"]], options: MatchingOptions) -> list[Features]:
-    """Features of every photo, in the order of the photos; OpenCV releases the interpreter lock."""
+def detect(
+    paths: Sequence[Path], options: MatchingOptions
+) -> tuple[list[tuple[PhotoInfo, Features]], list[PhotoProblem]]:
+    """Features of every readable photo, in the order of the paths, and the files that are none.
+
+    Decoding and extraction release the interpreter lock. A photo is let go as soon as its features are known.
+    """
     extractor = Sift(options.sift)
+
+    def one(path: Path) -> tuple[PhotoInfo, Features] | PhotoProblem:
+        try:
+            photo = read_photo(path)
+        except InputError as error:
+            return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
+        return photo.info, extractor(photo.rgb)
+
     with ThreadPoolExecutor(options.threads) as pool:
-        return list(pool.map(extractor, images))
+        results = list(pool.map(one, paths))
+    return (
+        [result for result in results if not isinstance(result, PhotoProblem)],
+        [result for result in results if isinstance(result, PhotoProblem)],
+    )
+
+
+def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
+    """Photos by name, decoded when they are asked for; the last few are kept."""
+    by_name = {path.name: path for path in paths}
+
+    @lru_cache(maxsize=8)
+    def photo_of(name: str) -> np.ndarray | None:
+        return read_photo(by_name[name]).rgb if name in by_name else None
+
+    return photo_of
 
 
 def match_features(
-    names: list[str], features: list[Features], keypoints: list[Float[np.ndarray, "_ 2"]], options: MatchingOptions
+    names: list[str],
+    features: list[Features],
+    keypoints: list[Float[np.ndarray, "_ 2"]],
+    pairs: list[ImagePair],
+    options: MatchingOptions,
 ) -> MatchGraph:
-    """Putative matches of all pairs, in the order of the pairs."""
-    matcher, pairs = MutualRatio(options.max_ratio), exhaustive(features)
+    """Putative matches of the pairs, in their order."""
+    matcher = MutualRatio(options.max_ratio)
     with ThreadPoolExecutor(options.threads) as pool:
         matches = list(pool.map(lambda pair: matcher(features[pair[0]], features[pair[1]]), pairs))
     return MatchGraph(
@@ -166,8 +208,29 @@ def match_features(
     )
 
 
+def gps_positions(infos: Sequence[PhotoInfo]) -> Float[np.ndarray, "n 3"] | None:
+    """Metres east, north and up of the first GPS position, nan without one; None if no photo has any.
+
+    A plane tangent to a sphere: close enough to find neighbours.
+    """
+    places = [info.exif.gps for info in infos]
+    known = [gps for gps in places if gps is not None]
+    if not known:
+        return None
+    origin = known[0]
+    metres_per_degree = np.deg2rad(1.0) * EARTH_RADIUS_M
+    east = metres_per_degree * np.cos(np.deg2rad(origin.latitude_deg))
+    out = np.full((len(infos), 3), np.nan)
+    for row, gps in zip(out, places, strict=True):
+        if gps is not None:
+            row[0] = (gps.longitude_deg - origin.longitude_deg) * east
+            row[1] = (gps.latitude_deg - origin.latitude_deg) * metres_per_degree
+            row[2] = gps.altitude_m or 0.0
+    return out
+
+
 def cameras_of_photos(
-    photos: list[Photo], options: MatchingOptions
+    infos: Sequence[PhotoInfo], options: MatchingOptions
 ) -> tuple[tuple[Camera, ...], Int[np.ndarray, "n"], list[str]]:
     """Cameras, the camera of each photo, and where each camera's focal length comes from: given, exif or guess.
 
@@ -176,9 +239,8 @@ def cameras_of_photos(
     cameras: list[Camera] = []
     source: list[str] = []
     index: dict[tuple, int] = {}
-    camera_of_image = np.empty(len(photos), dtype=np.int64)
-    for k, photo in enumerate(photos):
-        info = photo.info
+    camera_of_image = np.empty(len(infos), dtype=np.int64)
+    for k, info in enumerate(infos):
         exif = (None, None) if options.single_camera else (info.exif.camera, info.exif.focal_px)
         key = (info.width, info.height, *exif)
         if key not in index:

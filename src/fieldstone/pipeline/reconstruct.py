@@ -78,8 +78,8 @@ def reconstruct(
             write_colmap(model, out / "sparse" / str(k))
     if len(run.reconstruction.points):
         write_points(run.reconstruction.points, out / "points.ply")
-    small = thumbnails(run.graph.names, material.photos.get)
-    write_figures(out / "figures", "mapping", mapping_figures(run, material.photos.get), small)
+    small = thumbnails(run.graph.names, material.photo_of)
+    write_figures(out / "figures", "mapping", mapping_figures(run, material.photo_of), small)
     seconds["writing"] = time.perf_counter() - start
     record = run_record(source, mapper, run, material, options.seed, seconds)
     # Relative, so that the two folders may move together.
