@@ -132,7 +132,7 @@ def bundle_adjust(problem: BundleProblem, options: BundleOptions | None = None) 
         `triggs2000`, sections 6 and 9; `madsen2004`, damping; `agarwal2010`, the Schur complement at scale.
     """
     options = options or BundleOptions()
-    usable = _in_front(problem)
+    usable = in_front(problem)
     layout = lay_out(problem, usable)
     start = start_values(problem, layout)
     if layout.num_columns + layout.num_border == 0 and not np.any(layout.free_point[layout.point]):
@@ -235,7 +235,7 @@ def _evaluate(solver: _Solver, before: Values, moved: Values, out: Linearization
     return cost + solver.priors.cost(moved.params)
 
 
-def _in_front(problem: BundleProblem) -> Bool[np.ndarray, "o"]:
+def in_front(problem: BundleProblem) -> Bool[np.ndarray, "o"]:
     """Observations whose point lies in front of their camera and is finite."""
     depth = np.einsum("oj,oj->o", problem.cam_from_world.R[problem.view, 2], problem.points[problem.point])
     return (depth + problem.cam_from_world.t[problem.view, 2] > 0) & np.isfinite(problem.pixels).all(axis=1)

@@ -19,6 +19,19 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def mark_shared_tiles_numba(point_start, slot, free_point, per_tile, exists):
+    """Set exists[I, J], J <= I, where a free point is seen by slots of tile I and of tile J."""
+    for p in range(len(free_point)):
+        if not free_point[p]:
+            continue
+        for o in range(point_start[p], point_start[p + 1]):
+            for o2 in range(point_start[p], o + 1 if slot[o] >= 0 else 0):
+                if slot[o2] >= 0:
+                    exists[slot[o] // per_tile, slot[o2] // per_tile] = True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def eliminate_points_numba(
     start, stop, view, slot, point_start, camera_of_view, num_active, own, entry_start, entry_of_obs, free_point,
     B, J_camera, V, g_point, damping, L_inv, y, Z, Z_border,
@@ -35,7 +48,7 @@ def eliminate_points_numba(
                     Z_border[e, k, a] = 0.0
         a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if free_point[p]:
-            a0, a1, a2, a3, a4, a5 = _inverse_cholesky_numba(
+            a0, a1, a2, a3, a4, a5 = inverse_cholesky_numba(
                 V[p, 0] * grow, V[p, 1], V[p, 2] * grow, V[p, 3], V[p, 4], V[p, 5] * grow
             )
         L_inv[p, 0], L_inv[p, 1], L_inv[p, 2], L_inv[p, 3], L_inv[p, 4], L_inv[p, 5] = a0, a1, a2, a3, a4, a5
@@ -68,7 +81,7 @@ def eliminate_points_numba(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _inverse_cholesky_numba(v00, v10, v11, v20, v21, v22):
+def inverse_cholesky_numba(v00, v10, v11, v20, v21, v22):
     """L^-1 (00, 10, 11, 20, 21, 22) of a symmetric 3x3 matrix L L^T; zeros if it is not positive definite."""
     if v00 > 0.0:
         l00 = np.sqrt(v00)

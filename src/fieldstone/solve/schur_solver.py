@@ -16,6 +16,7 @@ from fieldstone.solve.linearize_numba import gather_cameras_numba, linearize_poi
 from fieldstone.solve.projection_numba import MAX_CAMERA_PARAMS
 from fieldstone.solve.schur_numba import (
     eliminate_points_numba,
+    mark_shared_tiles_numba,
     move_points_numba,
     move_views_numba,
     reduce_border_numba,
@@ -156,11 +157,7 @@ def tile_pattern(layout: BundleLayout) -> TilePattern:
     count = -(-layout.num_slots // per_tile)
     exists = np.eye(count, dtype=bool)
     if count > 1:
-        free = (layout.slot >= 0) & layout.free_point[layout.point]
-        seen = np.zeros((count, len(layout.free_point)), dtype=np.float32)
-        seen[layout.slot[free] // per_tile, layout.point[free]] = 1.0
-        exists |= (seen @ seen.T) > 0
-    exists = np.tril(exists)
+        mark_shared_tiles_numba(layout.point_start, layout.slot, layout.free_point, per_tile, exists)
     index = np.full((count, count), -1)
     index[exists] = np.arange(exists.sum())
     num_given = num_tiles = int(exists.sum())
