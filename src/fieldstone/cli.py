@@ -230,7 +230,57 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-VERBS = {"reconstruct": reconstruct, "train": train, "render": render}
+def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: int = 0, seed: int = 0) -> int:
+    """The whole road on photos of a small house that the package makes itself, and what it misses the truth by.
+
+    Args:
+        out: Folder for photos, model, field, renders and report.html.
+        budget: Time for training the field: 60s, 5m.
+        threads: 0 takes all cores. The result of the reconstruction is the same for any number.
+        seed: Every random number of the run follows from it.
+    """
+    from fieldstone.pipeline.demo import run_demo
+    from fieldstone.pipeline.material import MatchingOptions
+    from fieldstone.pipeline.reconstruct import ReconstructOptions
+
+    console = _console()
+    options = ReconstructOptions(matching=MatchingOptions(threads=threads or os.cpu_count() or 1), seed=seed)
+    with console.status("starting") as status:
+        record, metrics = run_demo(
+            out,
+            options,
+            field="tiny",
+            budget_s=_seconds(budget),
+            on_stage=status.update,
+            on_step=lambda p: status.update(f"training: {p.seconds:.0f} s, step {p.step}, PSNR {p.psnr:.2f} dB"),
+        )
+    _show_run(console, record, out)
+    truth = record.get("truth")
+    if truth is None:
+        return 4
+    console.print(
+        f"against the truth: rotation off by {truth['rotation_error_mean_deg']:.3f} deg, position by "
+        f"{1000 * truth['position_error_mean_m']:.1f} mm on average; held-out views: PSNR {metrics['psnr']:.2f} dB, "
+        f"SSIM {metrics['ssim']:.3f}\nopen {out / 'report.html'}",
+        markup=False,
+    )
+    return 0
+
+
+def report(source: Source, /) -> int:
+    """Write report.html of a folder anew, from what lies in it.
+
+    Args:
+        source: Folder that reconstruct, train or demo wrote.
+    """
+    from fieldstone.report.summary import write_report
+
+    path = write_report(source)
+    _console().print(f"open {path}", markup=False)
+    return 0
+
+
+VERBS = {"demo": demo, "reconstruct": reconstruct, "train": train, "render": render, "report": report}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -29,9 +29,12 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json
 from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
-from fieldstone.io.photos import write_photo
+from fieldstone.io.photos import read_photo, write_photo
 from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
 from fieldstone.render.views import render_view
+from fieldstone.report.figure_store import write_figures
+from fieldstone.report.figures import field_figures
+from fieldstone.report.summary import write_report
 
 logger = logging.getLogger(__name__)
 
@@ -108,6 +111,7 @@ def train_run(
         "version": __version__,
     }
     write_json(out / METRICS, metrics)
+    write_field_report(out, dataset, curve, metrics)
     return metrics
 
 
@@ -155,6 +159,20 @@ def evaluate_views(render_rays: RayRenderer, dataset: RayDataset, folder: Path) 
             f"background ({background}); {PROTOCOL}; equal images count as {MAX_PSNR:.0f} dB"
         ),
     }
+
+
+def write_field_report(out: Path, dataset: RayDataset, curve: Sequence[CurvePoint], metrics: Mapping[str, Any]) -> None:
+    """Add the training curve and rendered beside true views to the report of the folder."""
+    labels = view_labels([image.name for image in dataset.test])
+    rendered = {label: read_photo(out / "renders" / "test" / f"{label}.png").rgb for label in labels}
+    background = dataset.frame.background
+    true = {
+        label: np.rint(255.0 * image.composited(background)).astype(np.uint8)
+        for label, image in zip(labels, dataset.test, strict=True)
+    }
+    figures = field_figures([asdict(point) for point in curve], rendered, true, metrics["views"])
+    write_figures(out / "figures", "field", figures)
+    write_report(out)
 
 
 def run_header(field: str, options: TrainOptions, seed: int, dataset: RayDataset) -> dict[str, Any]:
