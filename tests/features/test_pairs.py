@@ -8,6 +8,7 @@ from fieldstone.features.pairs import (
     choose_pairs,
     exhaustive,
     nearby,
+    partners_of_partners,
     sequential,
     spanning_trees,
     strongest,
@@ -90,6 +91,14 @@ def test_spanning_trees_are_the_heaviest():
     assert connects(two - {pairs[k] for k in best})
     assert spanning_trees(pairs, score, n, 50) == set(pairs)
     assert spanning_trees([], np.empty(0), n, 2) == set()
+
+
+def test_partners_of_partners_are_ranked_by_common_partners():
+    # 0 and 3 share 1 and 2; 0 and 4 share 2 only; 5 knows nobody.
+    pairs = [(0, 1), (0, 2), (1, 3), (2, 3), (2, 4)]
+    assert partners_of_partners(pairs, 6, 9) == [(0, 3), (0, 4), (1, 2), (3, 4)]
+    assert partners_of_partners(pairs[:-1] + [(2, 4)], 6, 1) == [(0, 3), (0, 4), (1, 2)]
+    assert partners_of_partners([], 6, 3) == []
 
 
 def test_every_photo_keeps_its_strongest_pairs():

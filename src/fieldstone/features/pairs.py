@@ -59,8 +59,10 @@ class PairOptions:
 
     max_exhaustive: int = 12
     """Up to this many photos all pairs are matched."""
-    num_candidates: int = 40
+    num_candidates: int = 25
     """Most similar photos of each photo, whose few largest features are matched to rank them."""
+    num_indirect: int = 15
+    """Then as many photos of each photo that share the most good partners with it."""
     num_preview: int = 1024
     """Features of the largest scale used for that: a hundredth of the work of all of them."""
     preview_ratio: float = 0.7
@@ -92,7 +94,8 @@ def choose_pairs(
     """All pairs of small sets; of large ones those that look alike, in number proportional to the photos.
 
     Candidates by similarity as a whole (and by position, where it is known) are ranked by how many of their largest
-    features match; every photo keeps its best partners, and spanning trees of the same ranking tie the rest.
+    features match, and so are the partners of their good partners; every photo keeps its best partners, and spanning
+    trees of the same ranking tie the rest.
 
     Source:
         Matching a few large features first: `wu2013`, section 3.
@@ -108,6 +111,12 @@ def choose_pairs(
         candidates |= {p for p in nearby(positions, options.num_candidates // 2) if np.isfinite(alike[p])}
     pairs = sorted(candidates)
     counts = preview_counts(features, pairs, options, threads=threads)
+    indirect = partners_of_partners(
+        [p for p, c in zip(pairs, counts, strict=True) if c >= options.min_preview], len(features), options.num_indirect
+    )
+    unseen = [p for p in indirect if p not in candidates]
+    pairs = pairs + unseen
+    counts = np.concatenate([counts, preview_counts(features, unseen, options, threads=threads)])
     # Similarity lies within (-1, 1): it decides between pairs with the same number of matches.
     score = counts + 0.5 * np.array([alike[p] for p in pairs])
     good = counts >= options.min_preview
@@ -124,6 +133,21 @@ def most_similar(alike: Float[np.ndarray, "n n"], count: int) -> list[ImagePair]
     """Pairs of each photo with the `count` others of the largest finite similarity."""
     best = np.argsort(-alike, axis=1, kind="stable")[:, :count]
     return ordered((i, int(j)) for i, row in enumerate(best) for j in row if np.isfinite(alike[i, j]))
+
+
+def partners_of_partners(pairs: Sequence[ImagePair], num_photos: int, count: int) -> list[ImagePair]:
+    """For each photo the `count` others, not its partners, with which it has the most partners in common."""
+    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    ones = np.ones(len(ends), dtype=np.int32)
+    half = coo_matrix((ones, (ends[:, 0], ends[:, 1])), shape=(num_photos, num_photos)).tocsr()
+    partners = half + half.T
+    common = (partners @ partners).tolil()
+    found = []
+    for photo, (others, shared) in enumerate(zip(common.rows, common.data, strict=True)):
+        known = {photo, *partners.indices[partners.indptr[photo] : partners.indptr[photo + 1]].tolist()}
+        ranked = sorted((-number, other) for other, number in zip(others, shared, strict=True) if other not in known)
+        found += [(photo, other) for _, other in ranked[:count]]
+    return ordered(found)
 
 
 def preview_counts(
