@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -127,8 +128,8 @@ def render_rays(
 def _tiny(p: Mapping[str, Tensor], positions: Tensor, directions: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
     x = _linear_with_direction(p, "layer1", positions, directions, num_samples)
     for i in range(2, 5):
-        x = _linear(p, f"layer{i}", F.elu_(x))
-    out = _linear(p, "layer5", F.elu_(x))
+        x = _linear(p, f"layer{i}", _Elu.apply(x))
+    out = _linear(p, "layer5", _Elu.apply(x))
     return out[:, 3], out[:, :3]
 
 
@@ -157,4 +158,26 @@ def _linear_with_direction(p: Mapping[str, Tensor], name: str, x: Tensor, direct
     weight = p[f"{name}.weight"]
     of_ray = torch.addmm(p[f"{name}.bias"], directions, weight[x.shape[1] :])
     of_sample = x @ weight[: x.shape[1]]
-    return of_sample.view(-1, s, of_ray.shape[1]).add_(of_ray[:, None]).view(of_sample.shape)
+    # Not in place: autograd would copy the gradient of a view that was written to.
+    return (of_sample.view(-1, s, of_ray.shape[1]) + of_ray[:, None]).view(of_sample.shape)
+
+
+class _Elu(torch.autograd.Function):
+    """x for x > 0, exp(x) - 1 below; a class because that is how torch takes a gradient by hand.
+
+    On CPUs twice as fast as torch's own, which computes expm1: exp(x) - 1 is off by 1e-7 in absolute terms, which is
+    nothing beside the other terms of the next layer's sums.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        # exp(x) - 1 >= x everywhere, so the larger of x and exp(min(x, 0)) - 1 is the ELU.
+        below = x.clamp(max=0).exp_().sub_(1)
+        out = torch.maximum(x, below, out=below)
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (out,) = ctx.saved_tensors
+        return out.clamp(max=0).add_(1).mul_(gradients[0])
