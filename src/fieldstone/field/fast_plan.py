@@ -1,0 +1,127 @@
+"""What a time budget buys: grids, steps and learning rates of a run of the fast field, decided in one place.
+
+Training goes through stages of growing resolution. A plan fixes the number of steps of each stage; the same plan gives
+the same bytes, however often the run is interrupted. A budget in seconds becomes a plan by measuring the first steps
+on the machine at hand; at the start of a stage, the steps of the stages to come are corrected once more by what the
+last stage really took. What was done is what the plan says.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from fieldstone.field.fast_grid import level_resolutions
+
+STAGE_SHARES = (0.08, 0.12, 0.2, 0.2, 0.2, 0.2)
+"""Share of the training time of each stage; the last ones have the same, finest resolution."""
+
+STAGE_HALVINGS = (2, 1, 0, 0, 0, 0)
+"""How often the finest resolution is halved in each stage."""
+
+COARSEST_LEVEL = 14
+"""Levels go down to about this many cells along the longest side."""
+
+
+@dataclass(frozen=True)
+class FastPlan:
+    """Everything that decides the result of a run, with the seed and the photos."""
+
+    finest: int
+    """Cells along the longest side of the box in the finest level."""
+    steps: tuple[int, ...]
+    """Steps of each stage."""
+    num_chunks: int = 8
+    """Parts that a step is split into, one or more for each thread; fixed, so that threads never change a result."""
+    samples_per_chunk: int = 1024
+    density_rate: float = 0.15
+    """Step of a raw density, at the start of training."""
+    feature_rate: float = 0.02
+    decoder_rate: float = 0.005
+    final_rate: float = 0.05
+    """Learning rates fall exponentially to this share."""
+    decay: float = 0.95
+    """Memory of the mean squared gradients of the grids."""
+    raw_offset: float = -3.0
+    """Raw density of the start: a ray then loses about 5 % of its light per 1/128 of the box."""
+    step_cells: float = 1.0
+    """Distance between samples, in cells of the finest level."""
+    min_weight: float = 4e-3
+    min_light: float = 1e-2
+    prune_density: float = 0.01
+    """Cells with less than this everywhere are given up."""
+    immediate_levels: int = 1
+    """Finest levels that move sample by sample."""
+
+    def __post_init__(self) -> None:
+        if len(self.steps) != len(STAGE_SHARES) or min(self.steps) < 1:
+            raise ValueError(f"a plan needs {len(STAGE_SHARES)} stages of at least one step, got {self.steps}")
+        if self.finest < 1:
+            raise ValueError(f"the finest level needs at least one cell, got {self.finest}")
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of all stages."""
+        return sum(self.steps)
+
+    def to_json(self) -> str:
+        """All settings, for `plan_from_json`."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    def stage_of(self, step: int) -> int:
+        """The stage that step number `step` (from 0) belongs to."""
+        return min(int(np.searchsorted(np.cumsum(self.steps), step, side="right")), len(self.steps) - 1)
+
+    def levels(self, stage: int) -> tuple[int, ...]:
+        """Resolutions of the levels that a stage has, coarse to fine."""
+        final = level_resolutions(self.finest, COARSEST_LEVEL)
+        return final[: max(len(final) - STAGE_HALVINGS[stage], 1)]
+
+    def rate_share(self, step: int) -> float:
+        """Share of the first learning rate that step number `step` uses: time, not steps, drives the decay."""
+        stage = self.stage_of(step)
+        before = sum(self.steps[:stage])
+        progress = sum(STAGE_SHARES[:stage]) + STAGE_SHARES[stage] * (step - before) / self.steps[stage]
+        return float(self.final_rate ** min(progress, 1.0))
+
+
+def plan_from_json(text: str) -> FastPlan:
+    """The plan of `FastPlan.to_json`.
+
+    Raises:
+        ValueError: Not a plan.
+    """
+    try:
+        settings = json.loads(text)
+        return FastPlan(**{**settings, "steps": tuple(settings["steps"])})
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"not a plan of the fast field: {error}") from error
+
+
+def plan_for_budget(budget_s: float, spent_s: float, seconds_per_step: float, finest: int) -> FastPlan:
+    """The plan whose stages take their shares of what is left of a budget.
+
+    Args:
+        spent_s: Already gone for reading and preparing.
+        seconds_per_step: Of a step in the first stage, measured.
+    """
+    left = max(budget_s - spent_s, 0.05)
+    slower = [1.0, 1.3, 1.7, 1.7, 1.7, 1.7]
+    steps = tuple(
+        max(round(left * share / (seconds_per_step * factor)), 1)
+        for share, factor in zip(STAGE_SHARES, slower, strict=True)
+    )
+    return FastPlan(finest=finest, steps=steps)
+
+
+def corrected(plan: FastPlan, stage: int, left_s: float, seconds_per_step: float) -> FastPlan:
+    """The plan with the steps of `stage` and all later ones set to what is left of the budget.
+
+    Args:
+        seconds_per_step: Expected for `stage`.
+    """
+    shares = STAGE_SHARES[stage:]
+    steps = [max(round(max(left_s, 0.0) * share / sum(shares) / seconds_per_step), 1) for share in shares]
+    return replace(plan, steps=plan.steps[:stage] + tuple(steps))

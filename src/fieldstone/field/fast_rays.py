@@ -1,0 +1,116 @@
+"""All training pixels whose rays can meet something, as one flat table that the kernels draw from."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.errors import InputError
+from fieldstone.field.fast_march_numba import Box
+from fieldstone.field.occupancy_numba import rays_that_hit
+from fieldstone.field.radiance_field import FieldFrame
+from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.geometry.camera import bearings_from_image
+from fieldstone.scene.rays import pixel_centers
+
+GOLDEN_RATIO = 0.6180339887498949
+
+
+class RayTable(NamedTuple):
+    """Row n: the ray from centers[image[n]] along rotations[image[n]] bearings[bearing[n]], and what it sees.
+
+    Rows are drawn in the order n_i = i stride mod rows: the stride is near the golden ratio of the number of rows and
+    prime to it, so that any run of draws is spread evenly over photos and pixels, and each row comes once a round.
+    """
+
+    image: np.ndarray
+    bearing: np.ndarray
+    rgba: np.ndarray
+    """uint8 (n, 4), straight alpha."""
+    bearings: np.ndarray
+    rotations: np.ndarray
+    """float32 (v, 3, 3): box axes from camera axes."""
+    centers: np.ndarray
+    stride: int
+
+
+def ray_table(
+    images: tuple[PosedImage, ...], frame: FieldFrame, box: Box, executor: Executor, *, use_alpha: bool = True
+) -> RayTable:
+    """The table of all pixels whose rays meet an occupied cell (all pixels, if the box is unbounded).
+
+    Args:
+        use_alpha: False composites the photos on the background of the frame and forgets their alpha.
+
+    Raises:
+        InputError: No ray meets the box.
+    """
+    first_bearing, bearings = _bearings(images)
+    poses = [image.cam_from_world for image in images]
+    rotation_of_frame = frame.normalized_from_world.R
+    rotations = np.stack([rotation_of_frame @ pose.R.T for pose in poses]).astype(np.float32)
+    centers = np.stack([frame.normalized_from_world.apply(pose.target_origin_in_source()) for pose in poses])
+    centers = centers.astype(np.float32)
+
+    def rows_of(v: int) -> tuple[np.ndarray, np.ndarray]:
+        camera = images[v].camera
+        first = first_bearing[id(camera)]
+        in_cam = bearings[first : first + camera.width * camera.height]
+        hit = np.ones(len(in_cam), dtype=np.uint8)
+        if not box.unbounded:
+            rays_that_hit(box, centers[v], np.ascontiguousarray(in_cam @ rotations[v].T), hit)
+        rows = np.flatnonzero((hit > 0) & np.isfinite(in_cam[:, 0]))
+        return (rows + first).astype(np.int32), _rgba(images[v], frame, use_alpha)[rows]
+
+    parts = list(executor.map(rows_of, range(len(images))))
+    counts = [len(rows) for rows, _ in parts]
+    total = sum(counts)
+    if total == 0:
+        raise InputError(
+            "no training ray meets the scene: no photo looks at where the others see something; check the poses "
+            "and, if there are masks, that the object is opaque in them"
+        )
+    return RayTable(
+        image=np.repeat(np.arange(len(images), dtype=np.int32), counts),
+        bearing=np.concatenate([rows for rows, _ in parts]),
+        rgba=np.concatenate([rgba for _, rgba in parts]),
+        bearings=bearings,
+        rotations=rotations,
+        centers=centers,
+        stride=coprime_stride(total),
+    )
+
+
+def coprime_stride(count: int) -> int:
+    """The number nearest above count times the golden ratio that has no divisor in common with count."""
+    stride = max(int(count * GOLDEN_RATIO), 1)
+    while np.gcd(stride, count) != 1:
+        stride += 1
+    return stride
+
+
+def _bearings(images: tuple[PosedImage, ...]) -> tuple[dict[int, int], Float[np.ndarray, "k 3"]]:
+    """Bearings of every pixel of every camera, and where each camera's start."""
+    first: dict[int, int] = {}
+    parts: list[np.ndarray] = []
+    count = 0
+    for image in images:
+        camera = image.camera
+        if id(camera) not in first:
+            first[id(camera)] = count
+            parts.append(bearings_from_image(camera, pixel_centers(camera.width, camera.height)).astype(np.float32))
+            count += len(parts[-1])
+    return first, np.concatenate(parts)
+
+
+def _rgba(image: PosedImage, frame: FieldFrame, use_alpha: bool) -> np.ndarray:
+    """(h w, 4) uint8."""
+    rgba = np.full((image.camera.width * image.camera.height, 4), 255, dtype=np.uint8)
+    if use_alpha or image.pixels.shape[2] == 3:
+        rgba[:, : image.pixels.shape[2]] = image.pixels.reshape(len(rgba), -1)
+    else:
+        rgba[:, :3] = np.rint(255.0 * image.composited(frame.background)).astype(np.uint8).reshape(-1, 3)
+    return rgba

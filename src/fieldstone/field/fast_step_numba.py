@@ -1,0 +1,126 @@
+"""One chunk of a training step: draw rays, march, decode, composite, and back to gradients."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from fieldstone.field.fast_decoder import Decoder
+from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
+from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
+
+GRADIENT_SCALE = np.float32(1e-2)
+"""Constant factor on all gradients; RMSprop and Adam do not depend on it."""
+
+
+class RayBatch(NamedTuple):
+    """Rays of one chunk, flat."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    target: np.ndarray
+    background: np.ndarray
+    jitter: np.ndarray
+    first: np.ndarray
+    passed: np.ndarray
+
+
+class Work(NamedTuple):
+    """What the samples and rays of one chunk need on the way, flat."""
+
+    per_ray: np.ndarray
+    d_per_ray: np.ndarray
+    hidden: np.ndarray
+    rgb: np.ndarray
+    d_color: np.ndarray
+    d_raw: np.ndarray
+
+
+class Chunk(NamedTuple):
+    """Room for one chunk. gradient: of the decoder, summed over the chunk."""
+
+    rays: RayBatch
+    samples: Samples
+    work: Work
+    gradient: Decoder
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@no_type_check
+def random_share(seed, number):
+    """A number in [0, 1) that depends on seed and number alone.
+
+    Source:
+        `steele2014`, the mixing function of SplitMix64.
+    """
+    h = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(number) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    h ^= h >> np.uint64(31)
+    return np.float32(np.int64(h >> np.uint64(40))) * np.float32(1.0 / 16777216.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def draw_rays(table, start, count, seed, background, rays):
+    """Rays number `start` to `start + count` of the table's sequence, with colours over the background."""
+    rows = np.uint64(table.image.shape[0])
+    scale = np.float32(1.0 / 255.0)
+    for n in range(count):
+        row = np.int64((np.uint64(start + n) % rows) * np.uint64(table.stride) % rows)
+        v, b = table.image[row], table.bearing[row]
+        x, y, z = table.bearings[b, 0], table.bearings[b, 1], table.bearings[b, 2]
+        alpha = np.float32(table.rgba[row, 3]) * scale
+        for c in range(3):
+            rays.origins[n * 3 + c] = table.centers[v, c]
+            rays.directions[n * 3 + c] = (
+                table.rotations[v, c, 0] * x + table.rotations[v, c, 1] * y + table.rotations[v, c, 2] * z
+            )
+            rays.background[n * 3 + c] = background[c]
+            color = np.float32(table.rgba[row, c]) * scale
+            rays.target[n * 3 + c] = color * alpha + background[c] * (np.float32(1) - alpha)
+        rays.jitter[n] = random_share(seed, start + n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def chunk_step(table, start, count, seed, background, grid, box, march, far, decoder, transposed, width, chunk):
+    """Gradients of one chunk: of the decoder in chunk.gradient, of the interpolated values in samples.features.
+
+    Returns (rays, samples, steps asked, sum of squared colour errors).
+    """
+    rays, samples, work = chunk.rays, chunk.samples, chunk.work
+    used = 4 * grid.per_unit.shape[0]
+    draw_rays(table, start, count, seed, background, rays)
+    num_rays, n, asked = march_rays(
+        grid,
+        box,
+        march,
+        rays.origins,
+        rays.directions,
+        rays.jitter,
+        far,
+        count,
+        width,
+        samples,
+        rays.first,
+        rays.passed,
+    )
+    decode_directions(decoder, rays.directions, num_rays, work.per_ray)
+    decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
+    loss = composite_backward(
+        samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, GRADIENT_SCALE,
+        work.d_color, work.d_raw,
+    )  # fmt: skip
+    chunk.gradient.feature_weights[:] = 0
+    chunk.gradient.direction_weights[:] = 0
+    chunk.gradient.hidden_bias[:] = 0
+    chunk.gradient.color_weights[:] = 0
+    chunk.gradient.color_bias[:] = 0
+    decode_backward(
+        decoder, transposed, n, num_rays, samples.features, width, used, samples.ray, rays.directions, work.hidden,
+        work.d_color, work.d_raw, work.d_per_ray, chunk.gradient,
+    )  # fmt: skip
+    return num_rays, n, asked, loss

@@ -1,0 +1,335 @@
+"""Training of the fast field: stages of growing resolution, steps that give the same bytes on any number of threads.
+
+A step has three parts, each split into a fixed number of pieces that any number of threads may take: chunks of rays
+(gradients), halves of levels (adding them up), ranges of the table (moving it).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from fieldstone.errors import InputError
+from fieldstone.field.fast_decoder import HIDDEN, Decoder, decoder_width, initial_decoder
+from fieldstone.field.fast_field import (
+    FOREVER,
+    FastField,
+    compress,
+    expand,
+    field_from_tensors,
+    occupancy_box,
+    renderer,
+)  # fmt: skip
+from fieldstone.field.fast_grid import CHANNELS, grid_layout
+from fieldstone.field.fast_grid_numba import add_gradient, step_by_sample, step_touched
+from fieldstone.field.fast_plan import FastPlan, plan_from_json
+from fieldstone.field.fast_rays import RayTable, ray_table
+from fieldstone.field.fast_step_numba import chunk_step
+from fieldstone.field.fast_workspace import Workspace, workspace
+from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
+from fieldstone.field.occupancy_numba import used_cells
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport
+from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage
+from fieldstone.geometry.rigid3 import Rigid3
+
+logger = logging.getLogger(__name__)
+
+EPSILON = np.float32(1e-8)
+DECODER_MEMORY = (0.9, 0.99)
+CELL_VERTICES = 2
+"""An occupancy cell is this many cells of the finest level wide."""
+
+PRUNE_AT = (0.25, 0.6)
+"""Shares of a stage after which empty cells are given up; also when a stage begins."""
+
+HULL_CELLS = 96
+"""Cells of the visual hull along the longest side of the box."""
+
+SPLITS = 8
+"""Pieces of the table that `step_touched` is split into."""
+
+
+@dataclass(frozen=True, eq=False)
+class FastState:
+    """Everything that the next step depends on. The arrays are updated in place by `FastTraining.step`."""
+
+    plan: FastPlan
+    step: int
+    cursor: int
+    """Rays drawn so far."""
+    chunk_rays: Int[np.ndarray, "c"]
+    """Rays that each chunk should draw next to fill its room."""
+    field: FastField
+    velocity: Float[np.ndarray, "t"]
+    """Mean squared gradient of each value of the grid."""
+    decoder_mean: Decoder
+    decoder_square: Decoder
+    workspace: Workspace
+    """Room for the next step; follows from the rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class FastTraining:
+    """Trains a fast field on a table of rays; a `FieldTraining`."""
+
+    rays: RayTable
+    frame: FieldFrame
+    occupancy: Occupancy
+    """Where something may be, before training."""
+    unbounded: bool
+    plan: FastPlan
+    seed: int
+    executor: Executor
+
+    def start(self) -> FastState:
+        """The state before the first step."""
+        levels = self.plan.levels(len(self.plan.steps) - 1)
+        rng = np.random.default_rng([self.seed, 1])
+        decoder = initial_decoder(decoder_width(len(levels)), rng)
+        layout = grid_layout(self.occupancy.extent, self.plan.levels(0))
+        table = np.zeros(layout.num_values, dtype=np.float32)
+        for level in range(layout.num_levels):
+            vertices = layout.level(table, level)
+            vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
+        field = FastField(
+            layout, table, decoder, self.occupancy, self.plan.raw_offset, self.plan.step_cells, self.unbounded
+        )
+        zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
+        rays = np.full(self.plan.num_chunks, self.plan.samples_per_chunk // 8, dtype=np.int64)
+        square = Decoder(*(np.zeros_like(weights) for weights in decoder))
+        velocity = np.zeros_like(table)
+        return FastState(self.plan, 0, 0, rays, field, velocity, zeros, square, workspace(field, self.plan))
+
+    def step(self, state: FastState, /) -> tuple[FastState, StepReport]:
+        """One step; grids and occupancy change at the steps that the plan says."""
+        state = self._scheduled(state)
+        plan = state.plan
+        share = plan.rate_share(state.step)
+        starts = state.cursor + np.concatenate([[0], np.cumsum(state.chunk_rays)])
+        found = self._gradients(state, starts)
+        counts = np.array([samples for _, samples, _, _ in found], dtype=np.int64)
+        self._move_grid(state, counts, share)
+        _adam(state.field.decoder, state, np.float32(plan.decoder_rate * share))
+        rays = np.array([rays for rays, _, _, _ in found], dtype=np.int64)
+        loss = sum(squared for _, _, _, squared in found)
+        mse = loss / (3.0 * max(int(rays.sum()), 1))
+        state = replace(
+            state,
+            step=state.step + 1,
+            cursor=int(starts[-1]),
+            chunk_rays=_next_rays(rays, counts, plan.samples_per_chunk),
+        )
+        return state, StepReport(loss=mse, mse=mse)
+
+    def _gradients(self, state: FastState, starts: np.ndarray) -> list[tuple[int, int, int, float]]:
+        field, room = state.field, state.workspace
+        transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
+        background = self.frame.background.astype(np.float32)
+
+        def chunk(c: int) -> tuple[int, int, int, float]:
+            return chunk_step(
+                self.rays, int(starts[c]), int(state.chunk_rays[c]), self.seed, background, room.grid, room.box,
+                room.march, FOREVER, field.decoder, transposed, field.width, room.chunks[c],
+            )  # fmt: skip
+
+        return list(self.executor.map(chunk, range(len(room.chunks))))
+
+    def _move_grid(self, state: FastState, counts: np.ndarray, share: float) -> None:
+        field, velocity, plan, room = state.field, state.velocity, state.plan, state.workspace
+        rates = np.full(8, plan.feature_rate * share, dtype=np.float32)
+        rates[[0, CHANNELS]] = plan.density_rate * share
+        decay = np.float32(plan.decay)
+        levels = field.layout.num_levels
+        first_immediate = max(levels - plan.immediate_levels, 0)
+
+        def add(piece: tuple[int, int]) -> None:
+            level, half = piece
+            arguments = (
+                room.grid, level, half, counts, plan.samples_per_chunk, room.samples.position, room.samples.features,
+                field.width,
+            )  # fmt: skip
+            if level < first_immediate:
+                add_gradient(*arguments, room.gradient, room.touched)
+            else:
+                step_by_sample(*arguments, velocity, rates, decay, EPSILON)
+
+        list(self.executor.map(add, [(level, half) for level in reversed(range(levels)) for half in (0, 1)]))
+        words = len(room.touched) // 8
+        bounds = [8 * (words * piece // SPLITS) for piece in range(SPLITS + 1)]
+
+        def move(piece: int) -> None:
+            step_touched(
+                field.table, velocity, room.gradient, room.touched, bounds[piece], bounds[piece + 1], rates, decay,
+                EPSILON,
+            )  # fmt: skip
+
+        list(self.executor.map(move, range(SPLITS)))
+
+    def _scheduled(self, state: FastState) -> FastState:
+        """Grow the grid at the first step of a stage, and give up empty cells when it is time."""
+        plan = state.plan
+        stage = plan.stage_of(state.step)
+        into_stage = state.step - sum(plan.steps[:stage])
+        prune = into_stage == 0 and stage > 0
+        prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
+        if prune:
+            field = self._pruned(state.field, plan.prune_density)
+            state = replace(state, field=field, workspace=replace(state.workspace, box=field.box()))
+        wanted = plan.levels(stage)
+        if wanted != state.field.layout.resolutions:
+            state = _grown(state, wanted)
+        return state
+
+    def _pruned(self, field: FastField, density: float) -> FastField:
+        spacing = float(field.layout.spacings[-1])
+        occupancy = field.occupancy.resampled(min(spacing * CELL_VERTICES, field.occupancy.cell_size))
+        cells = occupancy.cells.copy()
+        grid = field.layout.arrays(field.table)
+        threshold = np.float32(math.log(density))
+        pieces = np.linspace(0, len(cells), 17).astype(np.int64)
+
+        def piece(n: int) -> None:
+            used_cells(
+                grid,
+                cells,
+                occupancy.cell_size,
+                spacing,
+                np.float32(field.raw_offset),
+                threshold,
+                pieces[n],
+                pieces[n + 1],
+            )
+
+        list(self.executor.map(piece, range(16)))
+        if not cells.any():
+            return field
+        logger.debug("occupied cells: %.2f %% of %s", 100.0 * cells.mean(), cells.shape)
+        return replace(field, occupancy=Occupancy(occupancy.lower, occupancy.cell_size, cells))
+
+    def to_tensors(self, state: FastState, /) -> dict[str, np.ndarray]:
+        """The field, and what resuming needs besides."""
+        plan = state.plan
+        tensors = state.field.to_tensors() | {
+            "step": np.array(state.step, dtype=np.int64),
+            "cursor": np.array(state.cursor, dtype=np.int64),
+            "chunk_rays": state.chunk_rays,
+            "velocity": compress(state.field, state.velocity),
+            "plan": np.frombuffer(plan.to_json().encode(), dtype=np.uint8).copy(),
+        }
+        for name in Decoder._fields:
+            tensors[f"mean_{name}"] = getattr(state.decoder_mean, name)
+            tensors[f"square_{name}"] = getattr(state.decoder_square, name)
+        return tensors
+
+    def from_tensors(self, tensors: Mapping[str, np.ndarray], /) -> FastState:
+        """The state of a checkpoint.
+
+        Raises:
+            InputError: An array is missing or has the wrong shape.
+        """
+        field = field_from_tensors(tensors)
+        try:
+            plan = plan_from_json(tensors["plan"].tobytes().decode())
+            velocity = expand(field, tensors["velocity"]).table
+            mean = Decoder(*(tensors[f"mean_{name}"].copy() for name in Decoder._fields))
+            square = Decoder(*(tensors[f"square_{name}"].copy() for name in Decoder._fields))
+            step, cursor = int(tensors["step"]), int(tensors["cursor"])
+            rays = tensors["chunk_rays"].copy()
+            return FastState(plan, step, cursor, rays, field, velocity, mean, square, workspace(field, plan))
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"this checkpoint cannot be resumed ({error}); delete it and train again") from error
+
+    def renderer(self, state: FastState, /) -> RayRenderer:
+        """Renders rays in normalised coordinates with the field as it is now."""
+        return renderer(state.field, self.frame, self.executor)
+
+
+def fast_training(
+    images: tuple[PosedImage, ...],
+    frame: FieldFrame,
+    plan: FastPlan,
+    *,
+    seed: int,
+    executor: Executor,
+    use_alpha: bool = True,
+    unbounded: bool = False,
+) -> FastTraining:
+    """The training of a fast field on posed photos.
+
+    The box is `NORMALIZED_RADIUS` around the origin of the frame. Where photos have alpha, it shrinks to the visual
+    hull; in an unbounded scene, everything beyond the box is contracted into a shell around it.
+
+    Args:
+        use_alpha: False takes photos with alpha as photos on the background of the frame.
+
+    Raises:
+        InputError: No ray meets the scene.
+    """
+    reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
+    occupancy = full_box(np.full(3, -reach), np.full(3, 2.0 * reach), HULL_CELLS // 2)
+    if use_alpha and not unbounded and all(image.pixels.shape[2] == 4 for image in images):
+        masks = [image.pixels[:, :, 3] > 0 for image in images]
+        if not any(mask.any() for mask in masks):
+            raise InputError("all photos are fully transparent: their alpha is 0 everywhere; train without alpha")
+        poses = [_cam_from_normalized(image.cam_from_world, frame) for image in images]
+        cameras = [image.camera for image in images]
+        occupancy = visual_hull(occupancy, masks, cameras, poses, HULL_CELLS, executor).trimmed()
+        logger.info("visual hull: %.1f %% of a box of %s", 100 * occupancy.cells.mean(), occupancy.extent.round(3))
+        if not occupancy.cells.any():
+            raise InputError(
+                "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
+                "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
+            )
+    table = ray_table(images, frame, occupancy_box(occupancy, unbounded), executor, use_alpha=use_alpha)
+    return FastTraining(table, frame, occupancy, unbounded, plan, seed, executor)
+
+
+def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
+    """Pose of a camera in the frame; lengths are those of the frame."""
+    world = frame.normalized_from_world
+    R = cam_from_world.R @ world.R.T
+    return Rigid3(R, -R @ world.apply(cam_from_world.target_origin_in_source()))
+
+
+def _next_rays(rays: Int[np.ndarray, "c"], samples: Int[np.ndarray, "c"], room: int) -> Int[np.ndarray, "c"]:
+    """Rays that would fill the room if they had as many samples as the last ones, and a quarter more."""
+    return np.clip((1.25 * rays * room / np.maximum(samples, 1)).astype(np.int64), room // 64, room)
+
+
+def _adam(decoder: Decoder, state: FastState, rate: np.float32) -> None:
+    """One Adam step of the decoder with the gradients of all chunks, added in their order.
+
+    Source:
+        `kingma2015`, algorithm 1.
+    """
+    memory, square_memory = (np.float32(m) for m in DECODER_MEMORY)
+    count = state.step + 1
+    first = np.float32(1.0 - DECODER_MEMORY[0] ** count)
+    second = np.float32(1.0 - DECODER_MEMORY[1] ** count)
+    for name in Decoder._fields:
+        gradient = np.zeros_like(getattr(decoder, name))
+        for chunk in state.workspace.chunks:
+            gradient += getattr(chunk.gradient, name)
+        mean, square = getattr(state.decoder_mean, name), getattr(state.decoder_square, name)
+        mean[:] = memory * mean + (1 - memory) * gradient
+        square[:] = square_memory * square + (1 - square_memory) * gradient * gradient
+        getattr(decoder, name)[:] -= rate * (mean / first) / (np.sqrt(square / second) + EPSILON)
+
+
+def _grown(state: FastState, resolutions: tuple[int, ...]) -> FastState:
+    """The same field on more levels: old levels keep their values, new ones start at 0."""
+    old = state.field.layout
+    new = grid_layout(old.extent, resolutions)
+    table, velocity = np.zeros((2, new.num_values), dtype=np.float32)
+    for level, resolution in enumerate(old.resolutions):
+        target = new.resolutions.index(resolution)
+        new.level(table, target)[:] = old.level(state.field.table, level)
+        new.level(velocity, target)[:] = old.level(state.velocity, level)
+    field = replace(state.field, layout=new, table=table)
+    return replace(state, field=field, velocity=velocity, workspace=workspace(field, state.plan))

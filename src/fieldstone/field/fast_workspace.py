@@ -1,0 +1,75 @@
+"""Room in which the steps of the fast field work, allocated once for every size of the grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from fieldstone.field.fast_decoder import HIDDEN, Decoder
+from fieldstone.field.fast_field import FastField, room_for_samples
+from fieldstone.field.fast_grid import GridArrays
+from fieldstone.field.fast_grid_numba import BLOCK
+from fieldstone.field.fast_march_numba import Box, March, Samples
+from fieldstone.field.fast_plan import FastPlan
+from fieldstone.field.fast_step_numba import Chunk, RayBatch, Work
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """A field as the kernels take it, and buffers; everything here is overwritten by the next step."""
+
+    grid: GridArrays
+    box: Box
+    march: March
+    samples: Samples
+    """Of all chunks, one after the other."""
+    chunks: tuple[Chunk, ...]
+    """Views into `samples`, and what each chunk needs besides."""
+    gradient: Float[np.ndarray, "g"]
+    """Of the levels that move batch by batch; all 0 between steps."""
+    touched: UInt8[np.ndarray, "b"]
+    """Which blocks of `gradient` are not 0."""
+
+
+def workspace(field: FastField, plan: FastPlan) -> Workspace:
+    """Room for the steps of a plan on a field."""
+    layout = field.layout
+    room, width = plan.samples_per_chunk, field.width
+    samples = room_for_samples(room * plan.num_chunks, width)
+    chunks = tuple(_chunk(samples, n, room, width, field.decoder) for n in range(plan.num_chunks))
+    num_gradients = int(layout.offsets[max(layout.num_levels - plan.immediate_levels, 0)])
+    num_blocks = -(-num_gradients // (8 * BLOCK)) * 8
+    return Workspace(
+        layout.arrays(field.table), field.box(), field.march(plan.min_weight, plan.min_light), samples, chunks,
+        np.zeros(num_blocks * BLOCK, dtype=np.float32), np.zeros(num_blocks, dtype=np.uint8),
+    )  # fmt: skip
+
+
+def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder) -> Chunk:
+    """Chunk n: its part of the samples, as many rays as samples at most, and its own decoder gradient."""
+
+    def floats(count: int) -> np.ndarray:
+        return np.zeros(count, dtype=np.float32)
+
+    def part(array: np.ndarray, size: int, extra: int = 0) -> np.ndarray:
+        return array[n * room * size : (n + 1) * room * size + extra]
+
+    own = Samples(
+        part(samples.position, 3), part(samples.distance, 1), part(samples.alpha, 1), part(samples.tau, 1),
+        part(samples.light, 1), part(samples.ray, 1), part(samples.features, width),
+    )  # fmt: skip
+    rays = RayBatch(
+        floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(room),
+        np.zeros(room + 1, dtype=np.int64), floats(room),
+    )  # fmt: skip
+    work = Work(
+        floats(room * HIDDEN),
+        floats(room * HIDDEN),
+        floats(room * HIDDEN),
+        floats(3 * room),
+        floats(3 * room),
+        floats(room),
+    )
+    return Chunk(rays, own, work, Decoder(*(np.zeros_like(weights) for weights in decoder)))

@@ -1,0 +1,56 @@
+"""Small scenes for the tests of the fast field: a ball photographed from around, and a field with random values."""
+
+import numpy as np
+
+from fieldstone.field.fast_decoder import decoder_width, initial_decoder
+from fieldstone.field.fast_field import FastField
+from fieldstone.field.fast_grid import grid_layout
+from fieldstone.field.occupancy import full_box
+from fieldstone.field.radiance_field import FieldFrame
+from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.sim3 import Sim3
+from fieldstone.render.camera_paths import look_at
+from fieldstone.scene.rays import rays_from_view
+
+FRAME = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
+CAMERA = Camera("SIMPLE_PINHOLE", 40, 32, np.array([45.0, 20.0, 16.0]))
+RADIUS = 0.8
+
+
+def ball_images(n=8, camera=CAMERA, heights=(0.3, 1.6, -1.2)):
+    """Photos of an opaque ball at the origin, coloured by its normal, with alpha."""
+    images = []
+    for k in range(n):
+        angle = 2 * np.pi * k / n
+        eye = np.array([3.2 * np.cos(angle), 3.2 * np.sin(angle), heights[k % len(heights)]])
+        pose = look_at(eye, np.zeros(3), np.array([0.0, 0, 1]))
+        rays = rays_from_view(camera, pose)
+        b = np.sum(rays.origins * rays.directions, axis=1)
+        discriminant = b**2 - np.sum(rays.origins**2, axis=1) + RADIUS**2
+        normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
+        rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
+        pixels = np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
+        images.append(PosedImage(f"r_{k}", camera, pose, pixels))
+    return tuple(images)
+
+
+def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
+    """A field with density everywhere."""
+    occupancy = full_box(np.array([-1.0, -0.7, -0.5]), np.array([2.0, 1.5, 1.0]), 8)
+    layout = grid_layout(occupancy.extent, resolutions)
+    table = rng.normal(scale=0.5, size=layout.num_values).astype(np.float32)
+    decoder = initial_decoder(decoder_width(max_levels), rng)
+    for weights in decoder:
+        weights += rng.normal(scale=0.1, size=weights.shape).astype(np.float32)
+    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False)
+
+
+def random_rays(rng, field, count):
+    """Origins outside of the box and unit directions into it, float32."""
+    targets = field.occupancy.lower + rng.uniform(0.1, 0.9, (count, 3)) * field.layout.extent
+    origins = rng.normal(size=(count, 3))
+    origins *= 4.0 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = targets - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins.astype(np.float32), directions.astype(np.float32)

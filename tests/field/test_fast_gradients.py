@@ -1,0 +1,166 @@
+"""The hand-written gradients of the fast field against autograd, group by group, and against finite differences."""
+
+import numpy as np
+import pytest
+
+from fast_scenes import random_field, random_rays
+from fieldstone.field.fast_decoder import HIDDEN, Decoder, decode
+from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
+from fieldstone.field.fast_field import FOREVER, renderer, room_for_samples
+from fieldstone.field.fast_grid import interpolate
+from fieldstone.field.fast_grid_numba import BLOCK, add_gradient
+from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
+from fieldstone.field.volume_rendering import composite
+from fieldstone.scene.rays import Rays
+
+ROOM = 4096
+
+
+def forward_and_backward(
+    field, origins, directions, target, background
+) -> tuple[float, Decoder, np.ndarray, Samples, int]:
+    """Loss, its gradient by group, and the samples of all rays."""
+    count = len(origins)
+    grid, box, march = field.layout.arrays(field.table), field.box(), field.march(0.0, 0.0)
+    samples, width, used = room_for_samples(ROOM, field.width), field.width, 4 * field.layout.num_levels
+    first, passed = np.zeros(count + 1, np.int64), np.zeros(count, np.float32)
+    jitter = np.full(count, 0.3, np.float32)
+    rays, n, _ = march_rays(
+        grid,
+        box,
+        march,
+        origins.reshape(-1),
+        directions.reshape(-1),
+        jitter,
+        FOREVER,
+        count,
+        width,
+        samples,
+        first,
+        passed,
+    )
+    assert rays == count
+    per_ray, hidden = np.zeros(count * HIDDEN, np.float32), np.zeros(ROOM * HIDDEN, np.float32)
+    rgb, d_color, d_raw = np.zeros(3 * ROOM, np.float32), np.zeros(3 * ROOM, np.float32), np.zeros(ROOM, np.float32)
+    decode_directions(field.decoder, directions.reshape(-1), count, per_ray)
+    decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
+    loss = composite_backward(
+        samples, count, first, passed, target.reshape(-1), background.reshape(-1), rgb, np.float32(2), d_color, d_raw
+    )
+    gradient = Decoder(*(np.zeros_like(weights) for weights in field.decoder))
+    transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
+    decode_backward(
+        field.decoder, transposed, n, count, samples.features, width, used, samples.ray, directions.reshape(-1), hidden,
+        d_color, d_raw, np.zeros_like(per_ray), gradient,
+    )  # fmt: skip
+    table = np.zeros(-(-field.layout.num_values // (8 * BLOCK)) * 8 * BLOCK, dtype=np.float32)
+    touched = np.zeros(len(table) // BLOCK, dtype=np.uint8)
+    for level in range(field.layout.num_levels):
+        for half in (0, 1):
+            add_gradient(
+                grid, level, half, np.array([n]), ROOM, samples.position, samples.features, width, table, touched
+            )
+    return loss, gradient, table[: field.layout.num_values], samples, n
+
+
+@pytest.fixture
+def case():
+    rng = np.random.default_rng(3)
+    field = random_field(rng)
+    origins, directions = random_rays(rng, field, 60)
+    target, background = rng.random((2, 60, 3)).astype(np.float32)
+    return field, origins, directions, target, background
+
+
+def relative_error(actual, expected):
+    return np.linalg.norm(actual - expected) / np.linalg.norm(expected)
+
+
+def test_gradients_match_autograd(case):
+    torch = pytest.importorskip("torch")
+    from fieldstone.field.torch_field import packed_colors, torch_fast_field
+
+    field, _, directions, target, background = case
+    loss, gradient, table, samples, n = forward_and_backward(*case)
+    twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
+    colors = packed_colors(
+        twin,
+        torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64)),
+        torch.tensor(samples.ray[:n].astype(np.int64)),
+        torch.tensor(directions.astype(np.float64)),
+        torch.tensor(background.astype(np.float64)),
+        float(field.march(0.0, 0.0).depth_scale),
+    )
+    squared = ((colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
+    parameters = [*(twin.decoder[name] for name in Decoder._fields), *twin.levels]
+    expected = [g.numpy() for g in torch.autograd.grad(squared, parameters)]
+    assert loss == pytest.approx(squared.item(), rel=1e-4)
+    for name, of_group in zip(Decoder._fields, expected, strict=False):
+        assert relative_error(getattr(gradient, name), of_group) < 1e-4, name
+    for level, of_level in enumerate(expected[len(Decoder._fields) :]):
+        actual = field.layout.level(table, level)
+        for channel in range(4):
+            assert relative_error(actual[..., channel], of_level[..., channel]) < 1e-4, (level, channel)
+
+
+def test_gradients_match_finite_differences(case):
+    field, *rest = case
+    _, gradient, table, _, _ = forward_and_backward(field, *rest)
+    groups = {"color_bias": (field.decoder.color_bias, gradient.color_bias), "table": (field.table, table)}
+    for name, (values, derivative) in groups.items():
+        for index in np.argsort(-np.abs(derivative))[:3]:
+            step = np.float32(5e-3)
+            before = values[index]
+            values[index] = before + step
+            above = forward_and_backward(field, *rest)[0]
+            values[index] = before - step
+            below = forward_and_backward(field, *rest)[0]
+            values[index] = before
+            # Central differences of step h are off by h^2 / 6 of the third derivative, and by float32 rounding / h.
+            assert (above - below) / (2 * float(step)) == pytest.approx(derivative[index], rel=1e-2), name
+
+
+def test_decoder_matches_reference():
+    rng = np.random.default_rng(0)
+    field = random_field(rng)
+    n, width, used = 31, field.width, 12
+    features = rng.normal(size=(n, width)).astype(np.float32)
+    directions = rng.normal(size=(5, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    ray = rng.integers(0, 5, n).astype(np.int32)
+    per_ray, hidden, rgb = (
+        np.zeros(5 * HIDDEN, np.float32),
+        np.zeros(n * HIDDEN, np.float32),
+        np.zeros(3 * n, np.float32),
+    )
+    decode_directions(field.decoder, directions.reshape(-1), 5, per_ray)
+    decode_numba(field.decoder, n, features.reshape(-1), width, used, ray, per_ray, hidden, rgb)
+    expected = decode(field.decoder, features[:, :used].astype(np.float64), directions[ray].astype(np.float64))
+    np.testing.assert_allclose(rgb.reshape(n, 3), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_rendering_is_the_integral_of_density_and_color():
+    """A ray's colour from the kernels equals the sum over the same positions with the readable density and colour."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from fast_scenes import FRAME
+
+    rng = np.random.default_rng(5)
+    field = random_field(rng)
+    origins, directions = random_rays(rng, field, 20)
+    rays = Rays(origins.astype(np.float64), directions.astype(np.float64), np.zeros(20))
+    with ThreadPoolExecutor(1) as executor:
+        rendered = renderer(field, FRAME, executor, min_weight=0.0, min_light=0.0)(rays)
+    step = float(field.march(0.0, 0.0).step)
+    for n in range(20):
+        low = (field.occupancy.lower - rays.origins[n]) / rays.directions[n]
+        high = (field.occupancy.lower + field.occupancy.extent - rays.origins[n]) / rays.directions[n]
+        enter, leave = np.minimum(low, high).max(), np.maximum(low, high).min()
+        t = np.arange(enter + 0.5 * step, leave, step)
+        points = rays.origins[n] + t[:, None] * rays.directions[n]
+        values = interpolate(field.layout, field.table, points - field.occupancy.lower)
+        color = decode(field.decoder, values.reshape(len(t), -1), np.repeat(rays.directions[n : n + 1], len(t), axis=0))
+        density = field.density(points)
+        expected = composite(density[None], color[None], t[None], far=t[-1] + step, background=FRAME.background)
+        np.testing.assert_allclose(rendered.rgb[n], expected.rgb[0], atol=2e-4)
+        np.testing.assert_allclose(rendered.opacity[n], expected.opacity[0], atol=2e-4)

@@ -1,0 +1,141 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fast_scenes import FRAME, ball_images
+from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import psnr
+from fieldstone.field.fast_field import compress, expand, field_from_tensors
+from fieldstone.field.fast_plan import FastPlan, corrected, plan_for_budget, plan_from_json
+from fieldstone.field.fast_rays import coprime_stride
+from fieldstone.field.fast_training import FastTraining, fast_training
+from fieldstone.field.radiance_field import FieldTraining
+from fieldstone.scene.rays import rays_from_view
+
+PLAN = FastPlan(finest=32, steps=(5, 5, 5, 5, 5, 5), num_chunks=4, samples_per_chunk=512)
+
+
+def training(executor, plan=PLAN, images=None, **options) -> FastTraining:
+    return fast_training(images or ball_images(), FRAME, plan, seed=0, executor=executor, **options)
+
+
+def run(training, state, steps):
+    state, report = training.step(state)
+    for _ in range(steps - 1):
+        state, report = training.step(state)
+    return state, report
+
+
+def same_tensors(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].dtype == b[name].dtype
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.mark.parametrize("immediate_levels", [0, 1])
+def test_threads_do_not_change_a_bit(immediate_levels):
+    results = []
+    plan = replace(PLAN, immediate_levels=immediate_levels)
+    for threads in (1, 2, 5):
+        with ThreadPoolExecutor(threads) as executor:
+            work = training(executor, plan)
+            state, _ = run(work, work.start(), plan.total_steps)
+            results.append(work.to_tensors(state))
+    same_tensors(results[0], results[1])
+    same_tensors(results[0], results[2])
+
+
+@pytest.mark.parametrize("stop", [1, 20])
+def test_a_stop_does_not_change_a_bit(stop):
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor)
+        assert isinstance(work, FieldTraining)
+        through, _ = run(work, work.start(), PLAN.total_steps)
+        stopped, _ = run(work, work.start(), stop)
+        saved = {name: array.copy() for name, array in work.to_tensors(stopped).items()}
+        resumed, _ = run(work, work.from_tensors(saved), PLAN.total_steps - stop)
+        same_tensors(work.to_tensors(through), work.to_tensors(resumed))
+
+
+@pytest.mark.parametrize("use_alpha", [True, False])
+def test_a_ball_is_learned_in_seconds(use_alpha):
+    images = ball_images(20)
+    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 20))
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor, plan, images[1:], use_alpha=use_alpha)
+        state, report = run(work, work.start(), plan.total_steps)
+        image = images[0]
+        rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
+    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
+    assert report.mse < 0.01
+    # The mean colour alone gives 9 dB.
+    assert psnr(shown, image.composited(FRAME.background)) > 24.0
+    center = shown.shape[0] // 2 * image.camera.width + image.camera.width // 2
+    assert rendered.opacity[center] > 0.95
+    assert rendered.opacity[0] < 0.05
+
+
+def test_the_field_survives_saving():
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor)
+        state, _ = run(work, work.start(), 30)
+        rays = rays_from_view(ball_images()[0].camera, ball_images()[0].cam_from_world)
+        before = work.renderer(state)(rays)
+        again = work.renderer(work.from_tensors(work.to_tensors(state)))(rays)
+    np.testing.assert_array_equal(before.rgb, again.rgb)
+    np.testing.assert_array_equal(before.depth, again.depth)
+
+
+def test_unreachable_vertices_are_left_out():
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor)
+        state, _ = run(work, work.start(), 30)
+    vertices = compress(state.field, state.field.table)
+    assert 0 < len(vertices) < len(state.field.table) // 4
+    again = expand(state.field, vertices)
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
+    np.testing.assert_array_equal(state.field.density(points), again.density(points))
+
+
+@pytest.mark.parametrize("name", ["grid", "cells_box", "decoder_hidden_bias", "resolutions"])
+def test_a_checkpoint_without_an_array_is_refused(name):
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor)
+        tensors = work.to_tensors(work.start())
+    del tensors[name]
+    with pytest.raises(InputError, match="checkpoint"):
+        field_from_tensors(tensors)
+
+
+def test_photos_that_see_nothing_are_refused():
+    images = tuple(replace(image, pixels=np.zeros_like(image.pixels)) for image in ball_images())
+    with ThreadPoolExecutor(1) as executor, pytest.raises(InputError, match="alpha"):
+        training(executor, images=images)
+
+
+def test_every_row_is_drawn_once_a_round():
+    for count in (1, 2, 7, 1000, 4096):
+        stride = coprime_stride(count)
+        assert len(set((np.arange(count) * stride % count).tolist())) == count
+
+
+def test_a_plan_survives_json_and_rates_fall():
+    assert plan_from_json(PLAN.to_json()) == PLAN
+    shares = [PLAN.rate_share(step) for step in range(PLAN.total_steps)]
+    assert shares[0] == 1.0
+    assert np.all(np.diff(shares) < 0)
+    assert shares[-1] > PLAN.final_rate
+    with pytest.raises(ValueError, match="plan"):
+        plan_from_json('{"finest": 3}')
+
+
+def test_a_budget_is_shared_out_and_corrected():
+    plan = plan_for_budget(10.0, 1.0, 0.01, 64)
+    assert 400 < plan.total_steps < 900
+    slower = corrected(plan, 3, 3.0, 0.05)
+    assert slower.steps[:3] == plan.steps[:3]
+    assert sum(slower.steps[3:]) == pytest.approx(3.0 / 0.05, abs=2)
+    assert min(plan_for_budget(0.1, 5.0, 0.01, 64).steps) == 1
