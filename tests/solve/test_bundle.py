@@ -1,3 +1,4 @@
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +76,16 @@ def test_any_number_of_threads_gives_the_same_bits(num_views, reach):
         np.testing.assert_array_equal(other.problem.points, one.problem.points)
         np.testing.assert_array_equal(other.problem.cam_from_world.R, one.problem.cam_from_world.R)
         np.testing.assert_array_equal(other.problem.cam_from_world.t, one.problem.cam_from_world.t)
+
+
+def test_bundles_adjusted_at_the_same_time_do_not_disturb_each_other():
+    problems = [perturbed(mixed_problem(num_views=60, num_points=150, reach=3, seed=seed)) for seed in range(4)]
+    alone = [bundle_adjust(problem) for problem in problems]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda problem: bundle_adjust(problem, BundleOptions(threads=2)), problems))
+    for a, b in zip(alone, together, strict=True):
+        assert a.costs == b.costs
+        np.testing.assert_array_equal(a.problem.points, b.problem.points)
 
 
 def test_order_of_the_observations_does_not_matter():

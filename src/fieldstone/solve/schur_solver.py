@@ -129,6 +129,17 @@ class CameraSystem:
 
 
 @dataclass(frozen=True, eq=False)
+class ReducedSystem:
+    """Cameras after the points are eliminated; the blocks of views are in `Workspace.tiles`."""
+
+    border: Float[np.ndarray, "n s b"]
+    rhs: Float[np.ndarray, "s b"]
+    corner: Float[np.ndarray, "n n"]
+    """Lower triangle."""
+    rhs_border: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
 class Step:
     """Tangent of the cameras, and the decrease of the cost that their linear model promises."""
 
@@ -235,11 +246,11 @@ def camera_system(
     return system
 
 
-def solve_step(
+def reduce_system(
     layout: BundleLayout, pattern: TilePattern, values: Values, pivot: Float[np.ndarray, "3"], at: Linearization,
     system: CameraSystem, damping: float, work: Workspace, workers: Workers,
-) -> Step | None:  # fmt: skip
-    """The damped step of poses and cameras; None where the reduced system is not positive definite."""
+) -> ReducedSystem:  # fmt: skip
+    """Eliminate the points: the damped reduced camera system, its view blocks in `work.tiles`."""
     workers.over(
         eliminate_points_numba, workers.split(layout.point_start),
         layout.view, layout.slot, layout.point_start, layout.camera_of_view, layout.num_active, layout.own,
@@ -255,29 +266,36 @@ def solve_step(
         work.tiles, values.points, pivot, system.U, system.g, system.cross, damping, work.y, work.Z, work.Z_border,
         border, rhs,
     )  # fmt: skip
-    corner_diagonal = np.diag(system.corner)
-    corner = system.corner + damping * np.diag(corner_diagonal)
+    corner = system.corner + damping * np.diag(np.diag(system.corner))
     rhs_border = -system.g_border
     if n:
         reduce_border_numba(
             layout.border_start, layout.border_entries, layout.entry_start, layout.entry_camera, layout.entry_point,
             layout.num_active, layout.border_of_camera, work.Z_border, work.y, corner, rhs_border,
         )  # fmt: skip
-    solution = _solve_reduced(pattern, border, rhs, corner, rhs_border, work, workers)
+    return ReducedSystem(border, rhs, corner, rhs_border)
+
+
+def solve_step(
+    layout: BundleLayout, pattern: TilePattern, values: Values, pivot: Float[np.ndarray, "3"], at: Linearization,
+    system: CameraSystem, damping: float, work: Workspace, workers: Workers,
+) -> Step | None:  # fmt: skip
+    """The damped step of poses and cameras; None where the reduced system is not positive definite."""
+    reduced = reduce_system(layout, pattern, values, pivot, at, system, damping, work, workers)
+    solution = _solve_reduced(pattern, reduced, work, workers)
     if solution is None:
         return None
     dx, dx_border = solution
-    diagonal = np.einsum("saa->sa", system.U)
-    promised = np.sum((damping * diagonal * dx - system.g) * dx)
-    promised += np.sum((damping * corner_diagonal * dx_border - system.g_border) * dx_border)
+    promised = np.sum((damping * np.einsum("saa->sa", system.U) * dx - system.g) * dx)
+    promised += np.sum((damping * np.diag(system.corner) * dx_border - system.g_border) * dx_border)
     return Step(dx, dx_border, 0.5 * float(promised))
 
 
 def _solve_reduced(
-    pattern: TilePattern, border: Float[np.ndarray, "n s b"], rhs: Float[np.ndarray, "s b"],
-    corner: Float[np.ndarray, "n n"], rhs_border: Float[np.ndarray, "n"], work: Workspace, workers: Workers,
-) -> tuple[Float[np.ndarray, "s b"], Float[np.ndarray, "n"]] | None:  # fmt: skip
+    pattern: TilePattern, reduced: ReducedSystem, work: Workspace, workers: Workers
+) -> tuple[Float[np.ndarray, "s b"], Float[np.ndarray, "n"]] | None:
     """Solve [[S, border^T], [border, corner]] [dx; dx_border] = [rhs; rhs_border] by block elimination."""
+    border, rhs, corner, rhs_border = reduced.border, reduced.rhs, reduced.corner, reduced.rhs_border
     n, (s, b) = len(border), rhs.shape
     count, size = len(pattern.index), pattern.per_tile * b
     wide = np.zeros((n + 1, count * size))
