@@ -179,6 +179,19 @@ def test_a_collapsed_field_is_noticed_and_started_again(monkeypatch, caplog):
         assert np.isfinite(second_report.loss)
 
 
+def test_numbers_that_are_not_finite_are_a_collapse(monkeypatch):
+    monkeypatch.setattr(torch_training, "FLAT_STEPS", 3)
+    with torch_workers(1) as workers:
+        t = training(SMALL_TINY, workers)
+        tensors = t.to_tensors(t.start())
+        tensors["parameters"][0] = np.inf
+        state, curve = train(t, t.from_tensors(tensors), budget_s=None, max_steps=4)
+    assert state.attempt == 1
+    assert [point.psnr for point in curve[:3]] == [0.0, 0.0, 0.0]
+    assert curve[3].psnr > 0
+    assert bool(torch.all(torch.isfinite(state.parameters)))
+
+
 def test_flat_photos_are_no_collapse():
     pixels = np.full((12, 16, 3), 130, dtype=np.uint8)
     images = tuple(replace(image, pixels=pixels) for image in ball_images())

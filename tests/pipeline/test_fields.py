@@ -1,6 +1,7 @@
 """The verbs `train` and `render`, on a ball that is cheap to photograph and to learn."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -256,6 +257,16 @@ def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
     write_checkpoint(path, tensors, header)
     with pytest.raises(InputError, match="parameters"):
         render_run(out, frames=1, threads=1)
+
+
+def test_without_torch_the_way_out_is_named(tmp_path, monkeypatch):
+    source = write_blender_folder(tmp_path / "in")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for name in [name for name in sys.modules if name.startswith("fieldstone.field.torch_")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(InputError, match=r"pip install 'fieldstone\[torch\]'"):
+        train_run(source, tmp_path / "out", max_steps=1)
+    assert not (tmp_path / "out").exists()
 
 
 def test_labels_of_views():

@@ -241,9 +241,9 @@ class TorchTraining:
         else:
             loss, gradient = mse, total.gradient / numbers
         report = StepReport(loss, total.squared_error_final / numbers)
-        flat_steps = (
-            state.flat_steps + 1 if total.contrast() < MIN_CONTRAST * float(np.std(colors, axis=0).max()) else 0
-        )
+        # Written so that colours that are not finite count as flat.
+        has_contrast = total.contrast() >= MIN_CONTRAST * float(np.std(colors, axis=0).max())
+        flat_steps = 0 if has_contrast else state.flat_steps + 1
         if flat_steps >= FLAT_STEPS and state.attempt + 1 < MAX_ATTEMPTS:
             logger.warning(
                 "the field shows one flat colour since %d steps and would not recover; attempt %d starts afresh",

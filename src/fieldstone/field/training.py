@@ -155,4 +155,7 @@ def train(
 
 
 def _curve_point(step: int, seconds: float, report: StepReport) -> CurvePoint:
+    """A step whose numbers are not finite is the worst that a curve can show: PSNR 0."""
+    if not np.isfinite(report.loss) or not np.isfinite(report.mse):
+        return CurvePoint(step, seconds, 0.0, 0.0)
     return CurvePoint(step, seconds, report.loss, float(-10.0 * np.log10(max(report.mse, 1e-12))))
