@@ -43,7 +43,7 @@ def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
     decoder = initial_decoder(decoder_width(max_levels), rng)
     for weights in decoder:
         weights += rng.normal(scale=0.1, size=weights.shape).astype(np.float32)
-    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False)
+    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False, 0.0)
 
 
 def random_rays(rng, field, count):

@@ -27,7 +27,8 @@ def blender_folder(tmp_path):
 def test_train_then_render(blender_folder, tmp_path, capsys):
     pytest.importorskip("torch")
     out = tmp_path / "out"
-    assert main(["train", str(blender_folder), "-o", str(out), "--steps", "2", "--threads", "1"]) == 0
+    steps = ["--field", "tiny", "--steps", "2", "--threads", "1"]
+    assert main(["train", str(blender_folder), "-o", str(out), *steps]) == 0
     assert "1 held-out views: PSNR" in capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["steps"] == 2
@@ -41,7 +42,7 @@ def test_train_then_render(blender_folder, tmp_path, capsys):
     [
         (["train", "{in}", "-o", "{out}", "--budget", "soon"], "--budget soon"),
         (["train", "{in}/train", "-o", "{out}"], "no posed photos"),
-        (["train", "{in}", "-o", "{out}", "--device", "abacus"], "--device cpu"),
+        (["train", "{in}", "-o", "{out}", "--field", "tiny", "--device", "abacus"], "--device cpu"),
         (["render", "{in}"], "fieldstone train"),
     ],
 )

@@ -20,6 +20,7 @@ from fieldstone.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fieldstone.field.training import CurvePoint
     from fieldstone.pipeline.material import MatchingOptions
 
 # Heavy imports live in the verbs, so that help and usage errors come at once.
@@ -113,9 +114,11 @@ def train(
     /,
     out: Out,
     *,
-    field: Literal["tiny", "nerf"] = "tiny",
-    budget: str = "300s",
+    field: Literal["fast", "tiny", "nerf"] = "fast",
+    budget: str = "60s",
     steps: int | None = None,
+    plan: Path | None = None,
+    alpha: bool = True,
     photos: Path | None = None,
     device: str = "cpu",
     threads: int = 0,
@@ -126,38 +129,49 @@ def train(
     Args:
         source: Folder in the Blender format (transforms_train.json), or one that `reconstruct` wrote.
         out: Folder for the result: checkpoint.safetensors, metrics.json, curve.json, renders/test.
-        field: tiny is the small network of the course at 100x100, nerf the original NeRF at 400x400.
-        budget: Time for training in all, what earlier runs in this folder took included: 300s, 10m, 2h.
+        field: fast needs seconds to minutes and no torch; tiny is the small network of the course at 100x100, nerf the
+            original NeRF at 400x400.
+        budget: Time for reading and training in all, what earlier runs in this folder took included: 60s, 10m, 2h.
         steps: Stop after so many steps in all, if the budget lasts.
+        plan: The plan.json that an earlier run of the fast field left: the same plan gives the same bytes.
+        alpha: Use the transparency of photos; --no-alpha takes them as they look on the background (fast only).
         photos: Folder with the photos of a reconstruction, if they are not where they were.
-        device: cpu, cuda, mps.
+        device: cpu, cuda, mps (tiny and nerf).
         threads: 0 takes all cores. The result is the same for any number.
         seed: Every random number of the run follows from it.
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from fieldstone.pipeline.fast_fields import train_fast_run
     from fieldstone.pipeline.fields import train_run
 
+    if field != "fast" and (plan is not None or not alpha):
+        raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
+    if field == "fast" and device != "cpu":
+        raise InputError(f"the fast field runs on the CPU, not on {device}; leave --device out")
     budget_s = _seconds(budget)
     console = _console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]}"))
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("reading", total=budget_s, found="")
-        metrics = train_run(
-            source,
-            out,
-            field=field,
-            budget_s=budget_s,
-            max_steps=steps,
-            seed=seed,
-            device=device,
-            threads=threads or None,
-            photos=photos,
-            on_step=lambda p: progress.update(
-                task, completed=p.seconds, found=f"step {p.step}, training PSNR {p.psnr:.2f} dB"
-            ),
-            on_stage=lambda stage: progress.update(task, description=stage),
-        )
+
+        def show(point: CurvePoint) -> None:
+            found = f"step {point.step}, training PSNR {point.psnr:.2f} dB"
+            progress.update(task, completed=point.seconds, found=found)
+
+        shared: dict[str, Any] = {
+            "budget_s": budget_s,
+            "max_steps": steps,
+            "seed": seed,
+            "threads": threads or None,
+            "photos": photos,
+            "on_step": show,
+            "on_stage": lambda stage: progress.update(task, description=stage),
+        }
+        if field == "fast":
+            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, **shared)
+        else:
+            metrics = train_run(source, out, field=field, device=device, **shared)
     done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"
     if metrics["psnr"] is None:
         console.print(f"{done}; no photo was held out, so nothing is measured -> {out}", markup=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -48,6 +48,8 @@ class FastField:
     raw_offset: float
     step_cells: float
     unbounded: bool
+    near: float
+    """Distance from the camera at which rays begin."""
 
     @property
     def width(self) -> int:
@@ -63,7 +65,7 @@ class FastField:
         step = float(self.layout.spacings[-1]) * self.step_cells
         return March(
             np.float32(step), np.float32(self.raw_offset), np.float32(step / self.reference_length),
-            np.float32(min_weight), np.float32(min_light),
+            np.float32(min_weight), np.float32(min_light), np.float32(self.near),
         )  # fmt: skip
 
     @property
@@ -96,7 +98,7 @@ class FastField:
             "cells": np.packbits(self.occupancy.cells.reshape(-1)),
             "cells_shape": np.array(self.occupancy.cells.shape, dtype=np.int64),
             "cells_box": np.append(self.occupancy.lower, self.occupancy.cell_size),
-            "sampling": np.array([self.raw_offset, self.step_cells, float(self.unbounded)]),
+            "sampling": np.array([self.raw_offset, self.step_cells, float(self.unbounded), self.near]),
             **{f"decoder_{name}": value for name, value in self.decoder._asdict().items()},
         }
 
@@ -126,9 +128,9 @@ def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> FastField:
         occupancy = Occupancy(lower_and_size[:3].copy(), float(lower_and_size[3]), cells)
         layout = grid_layout(tensors["extent"], tuple(tensors["resolutions"].tolist()))
         decoder = Decoder(**{name: tensors[f"decoder_{name}"].copy() for name in Decoder._fields})
-        raw_offset, step_cells, unbounded = tensors["sampling"].tolist()
+        raw_offset, step_cells, unbounded, near = tensors["sampling"].tolist()
         empty = np.zeros(layout.num_values, dtype=np.float32)
-        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, bool(unbounded))
+        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, bool(unbounded), near)
         return expand(field, tensors["grid"])
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"this checkpoint does not hold a fast field ({error}); delete it and train again") from error
@@ -173,9 +175,7 @@ def expand(field: FastField, vertices: Float[np.ndarray, "v 4"]) -> FastField:
         start, row = start + len(level), row + count
     if row != len(vertices):
         raise ValueError(f"{len(vertices)} vertices for {row} places")
-    return FastField(
-        field.layout, table, field.decoder, field.occupancy, field.raw_offset, field.step_cells, field.unbounded
-    )
+    return replace(field, table=table)
 
 
 def room_for_samples(capacity: int, width: int) -> Samples:

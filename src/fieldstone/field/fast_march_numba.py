@@ -51,6 +51,8 @@ class March(NamedTuple):
     """Samples that give less to the pixel than this are left out."""
     min_light: np.float32
     """A ray ends where less light than this is left."""
+    near: np.float32
+    """Where rays begin: nothing can be learned of what is nearer."""
 
 
 class Samples(NamedTuple):
@@ -106,7 +108,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
         at(origins, ray * 3 + 1) - at(box.lower, 1),
         at(origins, ray * 3 + 2) - at(box.lower, 2),
     )
-    t, t_end = zero, np.float32(far)
+    t, t_end = march.near, np.float32(far)
     if not box.unbounded:
         t, t_end = cut_to_slab(ox, dx, zero, ex, t, t_end)
         t, t_end = cut_to_slab(oy, dy, zero, ey, t, t_end)

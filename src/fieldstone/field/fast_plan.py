@@ -25,6 +25,10 @@ COARSEST_LEVEL = 14
 """Levels go down to about this many cells along the longest side."""
 
 
+MAX_FINEST = 384
+"""Cells of the finest level along the longest side: 32 bytes each, dense, fit the memory of a laptop."""
+
+
 @dataclass(frozen=True)
 class FastPlan:
     """Everything that decides the result of a run, with the seed and the photos."""
@@ -98,6 +102,20 @@ def plan_from_json(text: str) -> FastPlan:
         return FastPlan(**{**settings, "steps": tuple(settings["steps"])})
     except (TypeError, KeyError) as error:
         raise ValueError(f"not a plan of the fast field: {error}") from error
+
+
+def finest_for(budget_s: float, extent: float, pixel_size: float) -> int:
+    """Cells along the longest side that the photos can show and the budget can fill.
+
+    More than three cells for two pixels are not seen; the number of cells at a surface grows with the square of the
+    resolution and the steps that they need with it, so that a budget eight times as long carries twice as many.
+
+    Args:
+        pixel_size: Width of a pixel at the distance of the scene, in the unit of extent.
+    """
+    seen = 1.5 * extent / pixel_size
+    affordable = 128.0 * (budget_s / 8.0) ** (1.0 / 3.0)
+    return int(np.clip(min(seen, affordable), 16, MAX_FINEST))
 
 
 def plan_for_budget(budget_s: float, spent_s: float, seconds_per_step: float, finest: int) -> FastPlan:

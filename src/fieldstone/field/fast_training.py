@@ -48,6 +48,9 @@ CELL_VERTICES = 2
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
 
+NEAR_SHARE = 0.5
+"""In an unbounded scene, rays begin at this share of the nearest distance of the frame."""
+
 HULL_CELLS = 96
 """Cells of the visual hull along the longest side of the box."""
 
@@ -97,9 +100,9 @@ class FastTraining:
         for level in range(layout.num_levels):
             vertices = layout.level(table, level)
             vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
-        field = FastField(
-            layout, table, decoder, self.occupancy, self.plan.raw_offset, self.plan.step_cells, self.unbounded
-        )
+        near = NEAR_SHARE * self.frame.near if self.unbounded else 0.0
+        offset, step = self.plan.raw_offset, self.plan.step_cells
+        field = FastField(layout, table, decoder, self.occupancy, offset, step, self.unbounded, near)
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
         rays = np.full(self.plan.num_chunks, self.plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))

@@ -10,6 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,12 +126,15 @@ def read_split(scene: BlenderScene, split: str) -> tuple[list[tuple[BlenderFrame
         raise InputError(f"the scene has no {split} images; it has {', '.join(s for s in scene.splits)}")
     read: list[tuple[BlenderFrame, Photo]] = []
     problems: list[PhotoProblem] = []
-    for frame in frames:
-        try:
-            read.append((frame, read_photo(frame.path)))
-        except InputError as error:
-            logger.warning("skipped %s", error)
-            problems.append(PhotoProblem(frame.path, str(error)))
+    with ThreadPoolExecutor() as pool:
+        # Decoding leaves Python's lock; results are taken in the order of the frames.
+        reading = [pool.submit(read_photo, frame.path) for frame in frames]
+        for frame, photo in zip(frames, reading, strict=True):
+            try:
+                read.append((frame, photo.result()))
+            except InputError as error:
+                logger.warning("skipped %s", error)
+                problems.append(PhotoProblem(frame.path, str(error)))
     if not read:
         raise InputError(f"none of {len(frames)} {split} images can be read; the first: {problems[0].reason}")
     return read, problems

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
-from fieldstone.field.radiance_field import in_world
+from fieldstone.field.fast_field import field_from_tensors, renderer
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world
 from fieldstone.field.training import TrainOptions
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
@@ -62,10 +65,9 @@ def render_run(
     frame = frame_from_header(header)
     camera = _camera(header["cameras"][0], size_px)
     poses_on_path = PATHS[path](poses, frames)
-    options = TrainOptions(**header["options"])
     threads = threads or os.cpu_count() or 1
-    with open_training(options, frame, None, seed=header["seed"], device=device, threads=threads) as training:
-        render_rays = in_world(training.renderer(training.from_tensors(state_tensors)), frame)
+    with open_renderer(header, state_tensors, frame, device=device, threads=threads) as render_normalized:
+        render_rays = in_world(render_normalized, frame)
 
         def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             for k in range(frames):
@@ -81,6 +83,20 @@ def render_run(
             for k, image in enumerate(images()):
                 write_photo(target / f"{k:04d}.png", image)
     return target
+
+
+@contextmanager
+def open_renderer(
+    header: Mapping[str, Any], state_tensors: Mapping[str, np.ndarray], frame: FieldFrame, *, device: str, threads: int
+) -> Iterator[RayRenderer]:
+    """The renderer of the field in a checkpoint, in normalised coordinates, with its worker threads."""
+    if header["field"] == "fast":
+        with ThreadPoolExecutor(threads) as executor:
+            yield renderer(field_from_tensors(state_tensors), frame, executor)
+        return
+    options = TrainOptions(**header["options"])
+    with open_training(options, frame, None, seed=header["seed"], device=device, threads=threads) as training:
+        yield training.renderer(training.from_tensors(state_tensors))
 
 
 def _camera(stored: dict, size_px: int | None) -> Camera:

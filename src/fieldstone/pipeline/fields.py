@@ -83,17 +83,17 @@ def train_run(
     on_stage("reading photos")
     options = PRESETS[field]
     dataset = read_ray_dataset(source, photos, options.image_size_px)
-    header = run_header(field, options, seed, dataset)
+    header = run_header(field, asdict(options), seed, dataset)
     threads = threads or os.cpu_count() or 1
     with open_training(options, dataset.frame, dataset, seed=seed, device=device, threads=threads) as training:
-        state, curve = _resume_or_start(training, out, header)
+        state, curve = resume_or_start(training, out, header)
         on_stage("training")
         views = scene_tensors(dataset.train)
 
         def save(state: Any, curve: tuple[CurvePoint, ...]) -> None:
             # The curve first: after a stop between the two it holds steps too many, which are dropped.
             write_json(out / CURVE, [asdict(point) for point in curve])
-            write_checkpoint(out / CHECKPOINT, {**views, **_prefixed(training.to_tensors(state))}, header)
+            write_checkpoint(out / CHECKPOINT, {**views, **prefixed(training.to_tensors(state))}, header)
 
         state, curve = train(
             training, state, budget_s=budget_s, max_steps=max_steps, curve=curve, on_step=on_step, save=save
@@ -175,7 +175,7 @@ def write_field_report(out: Path, dataset: RayDataset, curve: Sequence[CurvePoin
     write_report(out)
 
 
-def run_header(field: str, options: TrainOptions, seed: int, dataset: RayDataset) -> dict[str, Any]:
+def run_header(field: str, options: Mapping[str, Any], seed: int, dataset: RayDataset) -> dict[str, Any]:
     """What a checkpoint says of its run; equal headers mean that training can go on."""
     frame = dataset.frame
     cameras: list[Camera] = []
@@ -186,7 +186,7 @@ def run_header(field: str, options: TrainOptions, seed: int, dataset: RayDataset
         camera_of_view.append(next(k for k, camera in enumerate(cameras) if camera is image.camera))
     return {
         "field": field,
-        "options": asdict(options),
+        "options": dict(options),
         "seed": seed,
         "photos": fingerprint(dataset),
         "frame": {
@@ -234,13 +234,19 @@ def split_tensors(tensors: Mapping[str, np.ndarray]) -> tuple[Rigid3, dict[str, 
     return Rigid3(tensors["views.R"], tensors["views.t"]), state
 
 
-def _prefixed(tensors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def prefixed(tensors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The state of a field under the names that it has in a checkpoint."""
     return {f"state.{name}": array for name, array in tensors.items()}
 
 
-def _resume_or_start(
+def resume_or_start(
     training: FieldTraining[Any], out: Path, header: Mapping[str, Any]
 ) -> tuple[Any, tuple[CurvePoint, ...]]:
+    """The state and curve of the checkpoint in `out`, or of the start.
+
+    Raises:
+        InputError: `out` holds another field, or a damaged one.
+    """
     if not (out / CHECKPOINT).exists():
         return training.start(), ()
     tensors, found = read_checkpoint(out / CHECKPOINT)

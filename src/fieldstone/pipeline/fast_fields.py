@@ -1,0 +1,250 @@
+"""Posed photos to a fast field within a time budget: plan, training with checkpoints, held-out views.
+
+The clock starts before the photos are read and after the kernels are compiled (once per machine); it stops when
+training ends.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fieldstone import __version__
+from fieldstone.errors import InputError
+from fieldstone.field.fast_plan import FastPlan, corrected, finest_for, plan_for_budget, plan_from_json
+from fieldstone.field.fast_training import FastState, FastTraining, fast_training
+from fieldstone.field.radiance_field import FieldFrame, in_world
+from fieldstone.field.ray_dataset import PosedImage, RayDataset
+from fieldstone.field.training import CurvePoint, OnStep, train
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.sim3 import Sim3
+from fieldstone.io.atomic import write_json, write_text
+from fieldstone.io.checkpoint import write_checkpoint
+from fieldstone.pipeline.field_input import read_ray_dataset
+from fieldstone.pipeline.fields import (
+    CHECKPOINT,
+    CURVE,
+    METRICS,
+    evaluate_views,
+    prefixed,
+    resume_or_start,
+    run_header,
+    scene_tensors,
+)
+
+logger = logging.getLogger(__name__)
+
+PLAN = "plan.json"
+
+MAX_SIZE_PX = 4096
+"""Photos are reduced to this length of their longer side."""
+
+MEASURED_STEPS = 12
+"""Steps that are tried, and thrown away, to learn how fast the machine is."""
+
+TIME_KEPT = 0.97
+"""Share of the budget that is planned for: the last steps and the last checkpoint take what they take."""
+
+
+def train_fast_run(
+    source: Path,
+    out: Path,
+    *,
+    budget_s: float = 60.0,
+    max_steps: int | None = None,
+    plan: Path | None = None,
+    use_alpha: bool = True,
+    seed: int = 0,
+    threads: int | None = None,
+    photos: Path | None = None,
+    on_step: OnStep = lambda point: None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+) -> dict[str, Any]:
+    """Train a fast field on posed photos, render the held-out ones and measure them.
+
+    If `out` holds a checkpoint of the same photos and seed, training goes on with its plan, to the same bytes as
+    without the stop.
+
+    Args:
+        source: A Blender-format folder, or one that `reconstruct` wrote.
+        budget_s: Seconds for reading and training.
+        max_steps: Stop after so many steps of the plan.
+        plan: The plan.json of another run, to be followed to the letter; the budget is then ignored.
+        use_alpha: False takes photos with alpha as photos on the background.
+
+    Returns:
+        What `metrics.json` holds.
+
+    Raises:
+        InputError: The source or the plan cannot be used, or `out` holds another field.
+    """
+    if not budget_s > 0:
+        raise InputError(f"a budget must be positive, got {budget_s:g} s; say for example --budget 60s")
+    threads = threads or os.cpu_count() or 1
+    given = None if plan is None else _read_plan(plan)
+    with ThreadPoolExecutor(threads) as executor:
+        on_stage("compiling")
+        compile_kernels(executor)
+        started = time.perf_counter()
+        on_stage("reading photos")
+        dataset = read_ray_dataset(source, photos, MAX_SIZE_PX)
+        header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
+        training = _open(dataset, given, budget_s, use_alpha, seed, executor)
+        resumed = (out / CHECKPOINT).exists()
+        if given is None and not resumed:
+            spent = time.perf_counter() - started
+            seconds_per_step = measured_step(training)
+            found = plan_for_budget(TIME_KEPT * budget_s, spent, seconds_per_step, training.plan.finest)
+            training = replace(training, plan=found)
+        state, curve = resume_or_start(training, out, header)
+        views = scene_tensors(dataset.train)
+
+        def save(state: FastState, curve: tuple[CurvePoint, ...]) -> None:
+            write_json(out / CURVE, [asdict(point) for point in curve])
+            write_text(out / PLAN, state.plan.to_json() + "\n")
+            write_checkpoint(out / CHECKPOINT, {**views, **prefixed(training.to_tensors(state))}, header)
+
+        on_stage("training")
+        deadline = None if given is not None or resumed else started + TIME_KEPT * budget_s
+        state, curve = train_stages(
+            training, state, curve, deadline=deadline, max_steps=max_steps, on_step=on_step, save=save
+        )
+        elapsed = time.perf_counter() - started
+        on_stage("rendering held-out views")
+        metrics = evaluate_views(in_world(training.renderer(state), dataset.frame), dataset, out / "renders" / "test")
+    metrics |= {
+        "seconds": elapsed,
+        "steps": state.step,
+        "field": "fast",
+        "alpha": use_alpha,
+        "plan": asdict(state.plan),
+        "device": "cpu",
+        "threads": threads,
+        "seed": seed,
+        "version": __version__,
+    }
+    write_json(out / METRICS, metrics)
+    return metrics
+
+
+def train_stages(
+    training: FastTraining,
+    state: FastState,
+    curve: tuple[CurvePoint, ...],
+    *,
+    deadline: float | None,
+    max_steps: int | None,
+    on_step: OnStep,
+    save: Callable[[FastState, tuple[CurvePoint, ...]], None],
+) -> tuple[FastState, tuple[CurvePoint, ...]]:
+    """Follow the plan of a state to its end, stage by stage.
+
+    Args:
+        deadline: At the start of each stage, the steps to come are set to what fits until this time of
+            `time.perf_counter`; None: the plan stands.
+    """
+    while state.step < min(state.plan.total_steps, max_steps or state.plan.total_steps):
+        plan = state.plan
+        stage = plan.stage_of(state.step)
+        end = sum(plan.steps[: stage + 1])
+        last = min(end, max_steps or end)
+        before, began = state.step, time.perf_counter()
+
+        def save_unless_going_on(state: FastState, curve: tuple[CurvePoint, ...], last: int = last) -> None:
+            if state.step != last:
+                save(state, curve)
+
+        state, curve = train(
+            training, state, budget_s=None, max_steps=last, curve=curve, on_step=on_step, save=save_unless_going_on
+        )
+        now = time.perf_counter()
+        if deadline is not None and stage + 1 < len(plan.steps) and last == end:
+            slower = 1.4 if plan.levels(stage + 1) != plan.levels(stage) else 1.0
+            per_step = slower * (now - began) / (state.step - before)
+            state = replace(state, plan=corrected(plan, stage + 1, deadline - now, per_step))
+            logger.info(
+                "stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, now - began, state.plan.steps
+            )
+    save(state, curve)
+    return state, curve
+
+
+def measured_step(training: FastTraining) -> float:
+    """Seconds of a first step on this machine, by trying some."""
+    state = training.start()
+    times = []
+    for _ in range(MEASURED_STEPS):
+        began = time.perf_counter()
+        state, _ = training.step(state)
+        times.append(time.perf_counter() - began)
+    return float(np.median(times[2:]))
+
+
+def compile_kernels(executor: Executor) -> None:
+    """Run every kernel once, so that what follows measures the machine and not the compiler."""
+    camera = Camera("SIMPLE_PINHOLE", 12, 12, np.array([14.0, 6.0, 6.0]))
+    pixels = np.full((12, 12, 4), 255, dtype=np.uint8)
+    pixels[:3], pixels[:, :3] = 0, 0
+    image = PosedImage("compile", camera, Rigid3(np.eye(3), np.array([0.0, 0, 4])), pixels)
+    frame = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
+    plan = FastPlan(finest=64, steps=(1, 1, 1, 1, 1, 1), num_chunks=1, samples_per_chunk=256)
+    training = fast_training((image,), frame, plan, seed=0, executor=executor)
+    state = training.start()
+    for _ in range(plan.total_steps):
+        state, _ = training.step(state)
+    training.renderer(state)(training_view(image))
+
+
+def training_view(image: PosedImage) -> Any:
+    """The rays of a training photo."""
+    from fieldstone.scene.rays import rays_from_view
+
+    return rays_from_view(image.camera, image.cam_from_world)
+
+
+def _open(
+    dataset: RayDataset, given: FastPlan | None, budget_s: float, use_alpha: bool, seed: int, executor: Executor
+) -> FastTraining:
+    """The training of a dataset, with the given plan or a provisional one."""
+    unbounded = len(dataset.points_in_world) > 0
+    provisional = given or FastPlan(finest=64, steps=(1000,) * 6)
+    training = fast_training(
+        dataset.train,
+        dataset.frame,
+        provisional,
+        seed=seed,
+        executor=executor,
+        use_alpha=use_alpha,
+        unbounded=unbounded,
+    )
+    if given is not None:
+        return training
+    world = dataset.frame.normalized_from_world
+    distances = [np.linalg.norm(world.apply(image.cam_from_world.target_origin_in_source())) for image in dataset.train]
+    focal = np.median([np.mean(image.camera.focal) for image in dataset.train])
+    extent = float(np.max(training.occupancy.extent))
+    pixel_size = float(np.median(distances) / focal)
+    finest = finest_for(budget_s, extent, pixel_size)
+    if unbounded:
+        finest = min(2 * finest, MAX_UNBOUNDED)
+    return replace(training, plan=replace(provisional, finest=finest))
+
+
+MAX_UNBOUNDED = 256
+"""As `fast_plan.MAX_FINEST`, for a box of which nearly all cells may be used."""
+
+
+def _read_plan(path: Path) -> FastPlan:
+    try:
+        return plan_from_json(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a plan.json of a fast field ({error})") from error

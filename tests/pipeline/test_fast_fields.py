@@ -1,0 +1,91 @@
+import json
+
+import numpy as np
+import pytest
+
+from fast_scenes import ball_images
+from fieldstone.cli import main
+from fieldstone.errors import InputError
+from fieldstone.io.photos import write_photo
+from fieldstone.pipeline.fast_fields import train_fast_run
+
+
+@pytest.fixture(scope="module")
+def ball_folder(tmp_path_factory):
+    """The ball in the Blender format: 9 photos to train on, one to test."""
+    folder = tmp_path_factory.mktemp("ball")
+    images = ball_images(10)
+    camera = images[0].camera
+    angle = 2 * np.arctan(0.5 * camera.width / camera.focal[0])
+    for split, part in {"train": images[1:], "test": images[:1]}.items():
+        frames = []
+        for image in part:
+            write_photo(folder / split / f"{image.name}.png", image.pixels)
+            world_from_cam = np.eye(4)
+            world_from_cam[:3, :3] = image.cam_from_world.R.T @ np.diag([1.0, -1, -1])
+            world_from_cam[:3, 3] = image.cam_from_world.target_origin_in_source()
+            frames.append({"file_path": f"./{split}/{image.name}", "transform_matrix": world_from_cam.tolist()})
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return folder
+
+
+def checkpoint_bytes(folder):
+    return (folder / "checkpoint.safetensors").read_bytes()
+
+
+def write_plan(path, steps=5):
+    path.write_text(json.dumps({"finest": 32, "steps": [steps] * 6, "num_chunks": 2, "samples_per_chunk": 512}))
+    return path
+
+
+def test_a_budget_is_kept_and_leaves_its_plan(ball_folder, tmp_path):
+    metrics = train_fast_run(ball_folder, tmp_path / "out", budget_s=3.0, threads=1)
+    assert metrics["seconds"] < 4.5
+    assert metrics["steps"] == sum(metrics["plan"]["steps"])
+    assert metrics["psnr"] > 15.0
+    assert (tmp_path / "out" / "renders" / "test" / "r_0.png").is_file()
+    assert json.loads((tmp_path / "out" / "plan.json").read_text()) == json.loads(json.dumps(metrics["plan"]))
+
+
+def test_the_same_plan_gives_the_same_bytes_however_interrupted(ball_folder, tmp_path):
+    plan = write_plan(tmp_path / "plan.json")
+    train_fast_run(ball_folder, tmp_path / "a", plan=plan, threads=1)
+    train_fast_run(ball_folder, tmp_path / "b", plan=plan, max_steps=7, threads=2)
+    assert checkpoint_bytes(tmp_path / "a") != checkpoint_bytes(tmp_path / "b")
+
+    def stop(point):
+        if point.step == 18:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_fast_run(ball_folder, tmp_path / "b", plan=plan, threads=2, on_step=stop)
+    train_fast_run(ball_folder, tmp_path / "b", plan=plan, threads=2)
+    assert checkpoint_bytes(tmp_path / "a") == checkpoint_bytes(tmp_path / "b")
+
+
+def test_train_and_render_as_typed(ball_folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    plan = write_plan(tmp_path / "plan.json")
+    assert main(["train", str(ball_folder), "-o", str(out), "--plan", str(plan), "--no-alpha", "--threads", "1"]) == 0
+    assert "PSNR" in capsys.readouterr().out
+    assert main(["render", str(out), "--format", "png", "--frames", "2", "--threads", "1"]) == 0
+    assert (out / "renders" / "orbit" / "0001.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"budget_s": 0.0}, "budget"),
+        ({"plan": "nowhere.json"}, "nowhere.json"),
+    ],
+)
+def test_mistakes_are_named(ball_folder, tmp_path, arguments, message):
+    if "plan" in arguments:
+        arguments = {"plan": tmp_path / arguments["plan"]}
+    with pytest.raises(InputError, match=message):
+        train_fast_run(ball_folder, tmp_path / "out", **arguments)
+
+
+def test_the_other_fields_know_no_plan(ball_folder, tmp_path, capsys):
+    assert main(["train", str(ball_folder), "-o", str(tmp_path / "out"), "--field", "tiny", "--no-alpha"]) == 3
+    assert "--no-alpha" in capsys.readouterr().err
