@@ -18,7 +18,7 @@ from fieldstone.geometry.camera import CAMERA_MODELS
 from fieldstone.solve.bundle_problem import BundleProblem
 from fieldstone.solve.sorting_numba import border_entries_numba, counting_order_numba
 
-MIN_VIEWS_TO_ORDER = 40
+MIN_VIEWS_TO_ORDER = 100
 
 
 @dataclass(frozen=True, eq=False)
