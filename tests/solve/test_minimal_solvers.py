@@ -8,9 +8,12 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
 from fieldstone.geometry.triangulation import bearings
 from fieldstone.solve.five_point import five_point
+from fieldstone.solve.fundamental_numba import plane_and_parallax_numba, set_rank_two_numba
+from fieldstone.solve.homography import homography_four_point
 from fieldstone.solve.null_space_numba import null_space_numba
 from fieldstone.solve.p3p import p3p
 from fieldstone.solve.polynomial_roots import real_roots_numba, real_roots_of_cubic, real_roots_of_quadratic
+from fieldstone.solve.seven_point import seven_point
 
 DRAWS = 1000
 
@@ -144,3 +147,83 @@ def test_null_space_is_orthonormal_and_null(shape):
     null_space_numba(A.copy(), N)
     np.testing.assert_allclose(A.T @ N, 0, atol=1e-12)
     np.testing.assert_allclose(N.T @ N, np.eye(N.shape[1]), atol=1e-12)
+
+
+def plane_z1(rays: np.ndarray) -> np.ndarray:
+    return rays / rays[:, 2:]
+
+
+def up_to_sign(found: np.ndarray, expected: np.ndarray) -> float:
+    expected = expected / np.linalg.norm(expected)
+    return float(min(np.abs(found - expected).max(), np.abs(found + expected).max()))
+
+
+@pytest.mark.parametrize("kind", ["general", "near identity", "forward"])
+def test_seven_point_recovers_exact_fundamental_matrices(kind):
+    rng = np.random.default_rng(5)
+    errors = []
+    for _ in range(DRAWS):
+        truth, x1, _ = five_point_draw(kind, rng)
+        points = np.concatenate([x1, bearings(rng.uniform(-1, 1, size=(2, 2)))]) * rng.uniform(2, 8, size=(7, 1))
+        x1, x2 = plane_z1(points), plane_z1(truth.apply(points))
+        found = seven_point(x1, x2)
+        assert 1 <= len(found) <= 3
+        errors.append(min(up_to_sign(F, essential_from_pose(truth)) for F in found))
+        for F in found:
+            np.testing.assert_allclose(np.sum(x2 * (x1 @ F.T), axis=1), 0, atol=1e-9)
+            assert abs(np.linalg.det(F)) < 1e-9
+    assert np.mean(np.array(errors) < 1e-6) >= 0.99
+
+
+def test_homography_recovers_exact_planes():
+    rng = np.random.default_rng(6)
+    errors = []
+    for _ in range(DRAWS):
+        x1 = np.concatenate([rng.uniform(-1, 1, size=(4, 2)), np.ones((4, 1))], axis=1)
+        H = exp(0.3 * rng.normal(size=3)) + 0.3 * rng.normal(size=3)[:, None] * rng.normal(size=3) / 3
+        moved = x1 @ H.T
+        if np.linalg.det(H) <= 0 or np.any(moved[:, 2] <= 0.1):
+            continue
+        found = homography_four_point(x1, plane_z1(moved))
+        assert found is not None
+        errors.append(up_to_sign(found, H))
+        assert np.all(x1 @ found.T[:, 2] > 0)
+    assert len(errors) > DRAWS / 2
+    assert np.mean(np.array(errors) < 1e-6) >= 0.99
+
+
+def test_homography_needs_four_points_in_general_position():
+    square = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    line = np.array([[0.0, 0, 1], [1, 0, 1], [2, 0, 1], [0, 1, 1]])
+    folded = square[[0, 1, 3, 2]] * [1, 1, 1]
+    assert homography_four_point(line, square) is None
+    assert homography_four_point(square, line) is None
+    assert homography_four_point(square, folded) is None
+    assert homography_four_point(square, square) is not None
+
+
+def test_plane_and_parallax_gives_the_exact_fundamental_matrix():
+    rng = np.random.default_rng(7)
+    errors = []
+    for _ in range(DRAWS):
+        truth, x1, x2 = five_point_draw("general", rng)
+        n = rng.normal(size=3)
+        H = truth.R + 0.2 * np.outer(truth.t, n)
+        models = np.zeros((1, 12))
+        assert plane_and_parallax_numba(plane_z1(x1)[:2].copy(), plane_z1(x2)[:2].copy(), H.ravel(), models) == 1
+        errors.append(up_to_sign(models[0, :9].reshape(3, 3), essential_from_pose(truth)))
+    assert np.mean(np.array(errors) < 1e-6) >= 0.99
+    same = np.ones((2, 3))
+    assert plane_and_parallax_numba(same, same + [1.0, 0, 0], np.eye(3).ravel(), np.zeros((1, 12))) == 0
+
+
+def test_rank_two_is_that_of_the_singular_values():
+    rng = np.random.default_rng(8)
+    for _ in range(100):
+        U, S, Vt = np.linalg.svd(rng.normal(size=(3, 3)))
+        S[2] = 0.02 * S[1]
+        F, e1, e2 = (U * S @ Vt).ravel(), np.empty(3), np.empty(3)
+        set_rank_two_numba(F, e1, e2)
+        assert up_to_sign(F.reshape(3, 3), U[:, :2] * S[:2] @ Vt[:2]) < 1e-3
+        assert np.linalg.svd(F.reshape(3, 3))[1][2] < 1e-12
+        np.testing.assert_allclose(np.linalg.norm(F), 1)

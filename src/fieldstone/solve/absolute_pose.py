@@ -14,7 +14,10 @@ from fieldstone.solve.ransac import RansacOptions
 from fieldstone.solve.sampling import kernel_seed, soft_scale
 
 LOCAL_STEPS = 8
-FINAL_STEPS = 30
+# Scale of the last, soft refinement: per noise of the inliers, and at most this multiple of the threshold. Wider than
+# for epipolar errors, because two components per point leave outliers less room to agree by chance.
+SCALE_PER_SIGMA, SCALE_LIMIT = 4.0, 2.0
+FINAL_STEPS, FINAL_TOLERANCE = 30, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +67,15 @@ def estimate_absolute_pose(
     threshold2 = options.max_error_px**2
     pose = np.empty(12)
     cost, num_inliers, trials = consensus_numba(
-        POSE, data, np.empty(0, np.int64), threshold2, options.confidence, options.min_trials, options.max_trials,
-        LOCAL_STEPS, kernel_seed(rng), pose,
+        POSE, data, np.arange(len(rows)), False, threshold2, options.confidence, options.min_trials,
+        options.max_trials, LOCAL_STEPS, kernel_seed(rng), pose,
     )  # fmt: skip
     if not np.isfinite(cost) or num_inliers < 4:
         return None
-    scale = soft_scale(squared_errors(pose, data), options.max_error_px)
-    refine_model_numba(POSE, pose, data, threshold2, 1.0 / scale**2, 0.0, FINAL_STEPS)
+    scale = soft_scale(
+        squared_errors(pose, data), options.max_error_px, SCALE_PER_SIGMA, SCALE_LIMIT * options.max_error_px
+    )
+    refine_model_numba(POSE, pose, data, threshold2, 1.0 / scale**2, FINAL_TOLERANCE, FINAL_STEPS)
     inliers = np.zeros(len(pixels), dtype=bool)
     inliers[rows] = squared_errors(pose, data) < threshold2
     if inliers.sum() < 4:

@@ -50,17 +50,14 @@ def score_epipolar_numba(M, data, threshold2, max_cost, gain_in, gain_out, log_l
     As `reprojection_numba.score_pose_numba`.
     """
     n = data.shape[1]
-    cost = 0.0
-    inliers = 0.0
-    begin = 0
-    while begin < n:
+    cost, inliers = 0.0, 0.0
+    for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
         block_cost, block_inliers = score_block_numba(M, data, begin, end, threshold2)
         cost += block_cost
         inliers += block_inliers
-        begin = end
         log_ratio = inliers * gain_in + (end - inliers) * gain_out
-        if begin < n and (cost > max_cost or log_ratio > log_limit):
+        if end < n and (cost > max_cost or log_ratio > log_limit):
             return np.inf, inliers, end
     return cost, inliers, n
 
@@ -116,7 +113,9 @@ def epipolar_normal_equations_numba(M, data, threshold2, softness, rows, S):  # 
     truncated squares for softness 0, and the loss of Geman and McClure with scale c for softness 1 / c^2.
     """
     n = data.shape[1]
-    S[:, :] = 0.0
+    for i in range(10):
+        for j in range(10):
+            S[i, j] = 0.0
     cost, inliers = 0.0, 0.0
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
@@ -128,3 +127,16 @@ def epipolar_normal_equations_numba(M, data, threshold2, softness, rows, S):  # 
         for j in range(i):
             S[j, i] = S[i, j]
     return cost, inliers
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def epipolar_errors_numba(M, data, errors):  # fills errors (n,)
+    """Squared Sampson error in pixels of every match; 0 for a match at both epipoles."""
+    for i in range(data.shape[1]):
+        x1, y1, x2, y2 = data[0, i], data[1, i], data[2, i], data[3, i]
+        p1, p2, p3 = M[0] * x1 + M[1] * y1 + M[2], M[3] * x1 + M[4] * y1 + M[5], M[6] * x1 + M[7] * y1 + M[8]
+        q1, q2 = M[0] * x2 + M[3] * y2 + M[6], M[1] * x2 + M[4] * y2 + M[7]
+        C = x2 * p1 + y2 * p2 + p3
+        D = data[5, i] * (p1 * p1 + p2 * p2) + data[4, i] * (q1 * q1 + q2 * q2)
+        errors[i] = C * C / (D if D > 1e-300 else 1e-300)

@@ -10,9 +10,15 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.solve.epipolar_numba import BLOCK, epipolar_normal_equations_numba, score_block_numba
+from fieldstone.solve.epipolar_numba import BLOCK, epipolar_normal_equations_numba
 from fieldstone.solve.reprojection_numba import MIN_STEP2
-from fieldstone.solve.small_linear_numba import multiply3_numba, rotation_exp_numba, solve_damped_numba
+from fieldstone.solve.small_linear_numba import (
+    copy_row_numba,
+    multiply3_numba,
+    rotation_exp_numba,
+    solve_damped_numba,
+    squared_length_numba,
+)
 
 
 @njit(cache=True, nogil=True)
@@ -126,24 +132,24 @@ def refine_essential_numba(
     Ends when a step gains less than `tolerance` of the cost, or is too short to matter. Returns cost and inliers.
     """
     E, rows = np.empty(9), np.empty(10 * BLOCK)
-    S, S_new, H, g = np.empty((10, 10)), np.empty((10, 10)), np.empty((5, 5)), np.empty(5)
+    S, S_new, H = np.empty((10, 10)), np.empty((10, 10)), np.empty((6, 6))
     L, step, candidate, tangent = np.empty((5, 5)), np.empty(5), np.empty(12), np.empty((5, 9))
     essential_from_state_numba(state, E)
     cost, inliers = epipolar_normal_equations_numba(E, data, threshold2, softness, rows, S)
     damping = 1e-6
     for _ in range(max_steps):
         _essential_tangent(state, E, tangent)
-        project_normal_equations_numba(S, tangent, H, g)
-        if not solve_damped_numba(H, g, damping, L, step):
+        project_normal_equations_numba(S, tangent, H)
+        if not solve_damped_numba(H, damping, L, step):
             break
-        if np.dot(step, step) < MIN_STEP2:
+        if squared_length_numba(step) < MIN_STEP2:
             break
         _move_essential(state, step, candidate)
         essential_from_state_numba(candidate, E)
         new_cost, new_inliers = epipolar_normal_equations_numba(E, data, threshold2, softness, rows, S_new)
         if new_cost < cost:
             gain = cost - new_cost
-            state[:] = candidate
+            copy_row_numba(candidate, state)
             cost, inliers = new_cost, new_inliers
             S, S_new = S_new, S
             damping = max(damping * 0.1, 1e-12)
@@ -159,22 +165,24 @@ def refine_essential_numba(
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def project_normal_equations_numba(S, tangent, H, g):  # (10, 10), (k, 9) -> fills H (k, k), g (k,)
-    """H = T S T^T and g = T S_r, where the rows of T are derivatives of the nine matrix entries."""
-    for a in range(len(g)):
-        s = 0.0
-        for i in range(9):
-            s += tangent[a, i] * S[i, 9]
-        g[a] = s
-        for b in range(a + 1):
-            s = 0.0
+def project_normal_equations_numba(S, tangent, H):  # (10, 10), (k, 9) -> fills the lower triangle of H (k + 1, k + 1)
+    """H = T S T^T and, in its last row, T S_r, where the rows of T are derivatives of the nine matrix entries."""
+    k = len(tangent)
+    row = np.empty(9)
+    for a in range(k):
+        gradient = 0.0
+        for j in range(9):
+            gradient += tangent[a, j] * S[9, j]
+            dot = 0.0
             for i in range(9):
-                dot = 0.0
-                for j in range(9):
-                    dot += S[i, j] * tangent[b, j]
-                s += tangent[a, i] * dot
-            H[a, b] = s
-            H[b, a] = s
+                dot += tangent[a, i] * S[i, j]
+            row[j] = dot
+        H[k, a] = gradient
+        for b in range(a + 1):
+            dot = 0.0
+            for j in range(9):
+                dot += row[j] * tangent[b, j]
+            H[a, b] = dot
 
 
 @njit(cache=True, nogil=True)
@@ -187,7 +195,7 @@ def _essential_tangent(state, E, tangent):  # fills tangent (5, 9)
         tangent[1, 3 * i], tangent[1, 3 * i + 1], tangent[1, 3 * i + 2] = -e3, 0.0, e1
         tangent[2, 3 * i], tangent[2, 3 * i + 1], tangent[2, 3 * i + 2] = e2, -e1, 0.0
     moved = np.empty(12)
-    moved[:9] = state[:9]
+    copy_row_numba(state, moved)
     b1, b2, b3, c1, c2, c3 = _orthogonal_directions(state[9], state[10], state[11])
     moved[9], moved[10], moved[11] = b1, b2, b3
     essential_from_state_numba(moved, tangent[3])
@@ -228,17 +236,14 @@ def _move_essential(state, step, out):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def choose_pose_numba(state, data, threshold2, inliers):  # changes state (12,), fills inliers (n,) -> their number
-    """Of the four poses of E, the one with most matches in front of both cameras; only these stay inliers.
+def choose_pose_numba(state, data, inliers):  # changes state (12,) and inliers (n,) -> number of inliers
+    """Of the four poses of E, the one with most inliers in front of both cameras; only these stay inliers.
 
     Source:
         `hartley2004`, section 9.6.3.
     """
-    E, best = np.empty(9), np.empty(12)
-    essential_from_state_numba(state, E)
+    best = np.empty(12)
     n = data.shape[1]
-    for i in range(n):
-        inliers[i] = score_block_numba(E, data, i, i + 1, threshold2)[1] > 0.0
     best_count = -1
     for attempt in range(2):
         both_positive, both_negative = 0, 0
@@ -250,11 +255,11 @@ def choose_pose_numba(state, data, threshold2, inliers):  # changes state (12,),
         for count, sign in ((both_positive, 1.0), (both_negative, -1.0)):
             if count > best_count:
                 best_count = count
-                best[:9] = state[:9]
+                copy_row_numba(state, best)
                 best[9], best[10], best[11] = sign * state[9], sign * state[10], sign * state[11]
         if attempt == 0:
             other_rotation_numba(state)
-    state[:] = best
+    copy_row_numba(best, state)
     for i in range(n):
         if inliers[i]:
             d1, d2 = signs_of_depths_numba(state, data[0, i], data[1, i], data[2, i], data[3, i])

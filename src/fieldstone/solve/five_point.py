@@ -13,8 +13,6 @@ from fieldstone.solve.null_space_numba import null_space_numba
 from fieldstone.solve.polynomial_roots import real_roots_numba
 
 MAX_SOLUTIONS = 10
-# One array of scratch numbers for the whole solver, cut into these pieces.
-NULL, SCRATCH, EE, CONSTRAINTS, B_OF_Z, CHAIN, ROOTS, END = 0, 36, 120, 180, 380, 420, 580, 600
 
 
 def five_point(x1: Float[np.ndarray, "5 3"], x2: Float[np.ndarray, "5 3"]) -> list[Float[np.ndarray, "3 3"]]:
@@ -36,33 +34,30 @@ def five_point(x1: Float[np.ndarray, "5 3"], x2: Float[np.ndarray, "5 3"]) -> li
         E comes from the rows of the 3x3 system with the largest cross product.
     """
     models = np.empty((MAX_SOLUTIONS, 12))
-    a = np.ascontiguousarray((x1 / np.linalg.norm(x1, axis=1, keepdims=True)).T, np.float64)
-    b = np.ascontiguousarray((x2 / np.linalg.norm(x2, axis=1, keepdims=True)).T, np.float64)
-    count = five_point_numba(a, b, models, np.empty(END))
+    a = np.ascontiguousarray(x1 / np.linalg.norm(x1, axis=1, keepdims=True), np.float64)
+    b = np.ascontiguousarray(x2 / np.linalg.norm(x2, axis=1, keepdims=True), np.float64)
+    count = five_point_numba(a, b, models)
     return [models[k, :9].reshape(3, 3).copy() for k in range(count)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def five_point_numba(a, b, models, work):  # (3, 5), (3, 5) -> count; fills models (10, 12), the first 9 of each row
+def five_point_numba(a, b, models):  # (>= 5, 3), (>= 5, 3) -> count; fills models (10, 12), first 9 of each row
     """`five_point` into preallocated rows."""
-    A = work[SCRATCH : SCRATCH + 45].reshape((9, 5))
+    A, N = np.empty((9, 5)), np.empty((9, 4))
     for k in range(5):
         for i in range(3):
             for j in range(3):
-                A[3 * i + j, k] = b[i, k] * a[j, k]
-    N = work[NULL : NULL + 36].reshape((9, 4))
+                A[3 * i + j, k] = b[k, i] * a[k, j]
     null_space_numba(A, N)
-    M = work[CONSTRAINTS : CONSTRAINTS + 200].reshape((10, 20))
-    _constraints(N, work[EE : EE + 60].reshape((6, 10)), work[SCRATCH : SCRATCH + 10], M)
+    M = np.zeros((10, 20))
+    _constraints(N, M)
     if not _eliminate(M):
         return 0
-    B = work[B_OF_Z : B_OF_Z + 39].reshape((3, 13))
+    B, determinant, roots = np.empty((3, 13)), np.zeros(11), np.empty(16)
     _hidden_variable(M, B)
-    determinant = work[SCRATCH : SCRATCH + 11]
-    _determinant(B, determinant, work[SCRATCH + 11 : SCRATCH + 40])
-    roots = work[ROOTS : ROOTS + 16]
-    count = real_roots_numba(determinant, 10, work[CHAIN : CHAIN + 156].reshape((12, 13)), roots)
+    _determinant(B, determinant)
+    count = real_roots_numba(determinant, 10, np.empty((12, 13)), roots)
     kept = 0
     for k in range(count):
         if _essential_at(roots[k], B, N, models[kept]):
@@ -72,10 +67,9 @@ def five_point_numba(a, b, models, work):  # (3, 5), (3, 5) -> count; fills mode
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _constraints(N, EE, minor, M):
-    """Ten cubics as rows of M: 2 (E E^T - trace / 2) E for nine, det E for the last."""
-    M[:, :] = 0.0
-    EE[:, :] = 0.0
+def _constraints(N, M):
+    """Ten cubics as rows of M (zeros on entry): 2 (E E^T - trace / 2) E for nine, det E for the last."""
+    EE, minor = np.zeros((6, 10)), np.empty(10)
     k = 0
     for i in range(3):
         for j in range(i, 3):
@@ -100,7 +94,8 @@ def _constraints(N, EE, minor, M):
         add_product_2_1(EE[5], N[6 + j], M[6 + j])
     for j in range(3):
         p, q = (j + 1) % 3, (j + 2) % 3
-        minor[:] = 0.0
+        for c in range(10):
+            minor[c] = 0.0
         add_product_1_1(N[p], N[3 + q], 1.0, minor)
         add_product_1_1(N[q], N[3 + p], -1.0, minor)
         add_product_2_1(minor, N[6 + j], M[9])
@@ -159,13 +154,13 @@ def _hidden_variable(M, B):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _determinant(B, out, scratch):
-    """det B(z), a polynomial of degree ten: expansion along the column of 1."""
-    out[:] = 0.0
-    minor = scratch[:7]
+def _determinant(B, out):
+    """Add det B(z), a polynomial of degree ten, to out: expansion along the column of 1."""
+    minor = np.empty(7)
     for r in range(3):
         p, q = (r + 1) % 3, (r + 2) % 3
-        minor[:] = 0.0
+        for i in range(7):
+            minor[i] = 0.0
         for i in range(4):
             for j in range(4):
                 minor[i + j] += B[p, i] * B[q, 4 + j] - B[q, i] * B[p, 4 + j]
@@ -179,10 +174,15 @@ def _determinant(B, out, scratch):
 def _essential_at(z, B, N, model):
     """E of one root: (x, y, 1) is orthogonal to the rows of B(z); the best conditioned pair of rows gives it."""
     best, x, y = 0.0, 0.0, 0.0
+    rows = np.empty((3, 3))
+    for r in range(3):
+        for j in range(3):
+            c = B[r, 4 * j : 4 * j + 4]
+            rows[r, j] = ((c[3] * z + c[2]) * z + c[1]) * z + c[0]
+        rows[r, 2] += B[r, 12] * z * z * z * z
     for r in range(3):
         p, q = (r + 1) % 3, (r + 2) % 3
-        p1, p2, p3 = _cubic_at(B[p], 0, z), _cubic_at(B[p], 4, z), _cubic_at(B[p], 8, z) + B[p, 12] * z**4
-        q1, q2, q3 = _cubic_at(B[q], 0, z), _cubic_at(B[q], 4, z), _cubic_at(B[q], 8, z) + B[q, 12] * z**4
+        p1, p2, p3, q1, q2, q3 = rows[p, 0], rows[p, 1], rows[p, 2], rows[q, 0], rows[q, 1], rows[q, 2]
         c1, c2, c3 = p2 * q3 - p3 * q2, p3 * q1 - p1 * q3, p1 * q2 - p2 * q1
         scale = (p1 * p1 + p2 * p2 + p3 * p3) * (q1 * q1 + q2 * q2 + q3 * q3)
         quality = c3 * c3 / scale if scale > 0.0 else 0.0
@@ -198,10 +198,3 @@ def _essential_at(z, B, N, model):
     for i in range(9):
         model[i] *= s
     return np.isfinite(s) and s > 0.0
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _cubic_at(row, start, z):
-    """row[start] + row[start + 1] z + row[start + 2] z^2 + row[start + 3] z^3."""
-    return ((row[start + 3] * z + row[start + 2]) * z + row[start + 1]) * z + row[start]

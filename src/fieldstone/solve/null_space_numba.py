@@ -39,9 +39,9 @@ def null_space_numba(A, N):  # (m, k) columns are the equations, destroyed; fill
                 dot += A[i, j] * A[i, c]
             for i in range(j, m):
                 A[i, c] -= dot * A[i, j]
-    N[:, :] = 0.0
     for c in range(m - k):
-        N[k + c, c] = 1.0
+        for i in range(m):
+            N[i, c] = 1.0 if i == k + c else 0.0
         for j in range(k - 1, -1, -1):
             dot = 0.0
             for i in range(j, m):

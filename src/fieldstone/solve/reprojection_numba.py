@@ -14,7 +14,13 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.solve.small_linear_numba import multiply3_numba, rotation_exp_numba, solve_damped_numba
+from fieldstone.solve.small_linear_numba import (
+    copy_row_numba,
+    multiply3_numba,
+    rotation_exp_numba,
+    solve_damped_numba,
+    squared_length_numba,
+)
 
 BLOCK = 64
 MIN_STEP2 = 1e-22
@@ -58,17 +64,14 @@ def score_pose_numba(pose, data, threshold2, max_cost, gain_in, gain_out, log_li
         `matas2005` for the test; in blocks of points rather than after every point.
     """
     n = data.shape[1]
-    cost = 0.0
-    inliers = 0.0
-    begin = 0
-    while begin < n:
+    cost, inliers = 0.0, 0.0
+    for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
         block_cost, block_inliers = _score_block(pose, data, begin, end, threshold2)
         cost += block_cost
         inliers += block_inliers
-        begin = end
         log_ratio = inliers * gain_in + (end - inliers) * gain_out
-        if begin < n and (cost > max_cost or log_ratio > log_limit):
+        if end < n and (cost > max_cost or log_ratio > log_limit):
             return np.inf, inliers, end
     return cost, inliers, n
 
@@ -132,7 +135,9 @@ def pose_normal_equations_numba(pose, data, threshold2, softness, rows, S):  # f
     Source:
         `hartley2004`, section 7.2 (the geometric error of a camera).
     """
-    S[:, :] = 0.0
+    for i in range(7):
+        for j in range(7):
+            S[i, j] = 0.0
     cost, inliers = 0.0, 0.0
     n = data.shape[1]
     for begin in range(0, n, BLOCK):
@@ -173,15 +178,15 @@ def refine_pose_numba(pose, data, threshold2, softness, tolerance, max_steps):  
     cost, inliers = pose_normal_equations_numba(pose, data, threshold2, softness, rows, S)
     damping = 1e-6
     for _ in range(max_steps):
-        if not solve_damped_numba(S[:6, :6], S[6, :6], damping, L, step):
+        if not solve_damped_numba(S, damping, L, step):
             break
-        if np.dot(step, step) < MIN_STEP2:
+        if squared_length_numba(step) < MIN_STEP2:
             break
         _move_pose(pose, step, candidate)
         new_cost, new_inliers = pose_normal_equations_numba(candidate, data, threshold2, softness, rows, S_new)
         if new_cost < cost:
             gain = cost - new_cost
-            pose[:] = candidate
+            copy_row_numba(candidate, pose)
             cost, inliers = new_cost, new_inliers
             S, S_new = S_new, S
             damping = max(damping * 0.1, 1e-12)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-SCALE_PER_SIGMA = 2.0
 SIGMA_PER_MEDIAN = 1.4826
 
 
@@ -14,12 +13,12 @@ def kernel_seed(rng: np.random.Generator) -> np.uint64:
     return np.uint64(rng.integers(0, 2**63))
 
 
-def soft_scale(squared_errors: Float[np.ndarray, "n"], max_error_px: float) -> float:
-    """Scale in pixels of the Geman-McClure loss: twice the noise of the inliers, at most half of the threshold.
+def soft_scale(squared_errors: Float[np.ndarray, "n"], max_error_px: float, per_sigma: float, limit: float) -> float:
+    """Scale in pixels of the Geman-McClure loss: `per_sigma` times the noise of the inliers, at most `limit`.
 
     The noise is taken from the median error of the inliers, which a threshold that is wider than the noise does not
     change much.
     """
     inliers = squared_errors[squared_errors < max_error_px**2]
     sigma = SIGMA_PER_MEDIAN * float(np.sqrt(np.median(inliers))) if len(inliers) else max_error_px
-    return min(max(SCALE_PER_SIGMA * sigma, 1e-3 * max_error_px), 0.5 * max_error_px)
+    return min(max(per_sigma * sigma, 1e-3 * max_error_px), limit)

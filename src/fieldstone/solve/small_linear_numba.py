@@ -8,26 +8,27 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def solve_damped_numba(
-    H, g, damping, L, step
-):  # (k, k), (k,), scalar, (k, k) scratch, (k,) out -> solvable; lower triangles
+def solve_damped_numba(S, damping, L, step):  # (k + 1, k + 1), scalar, (k, k) scratch, (k,) out -> solvable
     """step = -(H + damping diag(H))^-1 g by Cholesky's factorisation; False where that is not positive definite.
 
-    Diagonal entries smaller than 1e-12 of the largest are damped as if they had that size.
+    S holds H in its first k rows and columns and g in its last row; its lower triangle is read. Diagonal entries
+    smaller than 1e-12 of the largest are damped as if they had that size.
     """
-    k = len(g)
+    k = len(step)
     largest = 0.0
     for i in range(k):
-        largest = max(largest, H[i, i])
-    if not largest > 0.0 or not np.isfinite(largest):
+        if S[i, i] > largest:
+            largest = S[i, i]
+    if not 0.0 < largest < np.inf:
         return False
+    floor = 1e-12 * largest
     for i in range(k):
         for j in range(i + 1):
-            s = H[i, j]
+            s = S[i, j]
             if i == j:
-                s += damping * max(H[i, i], 1e-12 * largest)
+                s += damping * (s if s > floor else floor)
             for m in range(j):
                 s -= L[i, m] * L[j, m]
             if i == j:
@@ -37,7 +38,7 @@ def solve_damped_numba(
             else:
                 L[i, j] = s / L[j, j]
     for i in range(k):
-        s = -g[i]
+        s = -S[k, i]
         for m in range(i):
             s -= L[i, m] * step[m]
         step[i] = s / L[i, i]
@@ -47,6 +48,24 @@ def solve_damped_numba(
             s -= L[m, i] * step[m]
         step[i] = s / L[i, i]
     return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def copy_row_numba(source, target):
+    """target[:len(source)] = source; cheaper to compile than a slice assignment."""
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def squared_length_numba(v):
+    """Sum of squares of a short row."""
+    s = 0.0
+    for i in range(len(v)):
+        s += v[i] * v[i]
+    return s
 
 
 @njit(cache=True, nogil=True)
