@@ -147,18 +147,23 @@ def test_fine_samples_lie_where_the_coarse_network_found_something():
     assert fine.weights.shape == (1, 48)
 
 
-def test_initial_parameters_are_the_same_for_a_seed_and_bounded():
-    flat = initial_parameters(TINY, np.random.default_rng(3))
-    np.testing.assert_array_equal(flat, initial_parameters(TINY, np.random.default_rng(3)))
-    p = split_parameters(TINY, torch.from_numpy(flat))
-    for name, (n_in, n_out) in layer_sizes(TINY).items():
-        weight = p[f"{name}.weight"]
-        bound = np.sqrt(6 / (n_in + n_out))
-        assert 0.95 * bound < float(weight.abs().max()) <= bound
+@pytest.mark.parametrize("options", [TINY, NERF], ids=["tiny", "nerf"])
+def test_initial_parameters_are_the_same_for_a_seed_and_bounded(options):
+    flat = initial_parameters(options, np.random.default_rng(3))
+    np.testing.assert_array_equal(flat, initial_parameters(options, np.random.default_rng(3)))
+    p = split_parameters(options, torch.from_numpy(flat))
+    for name, (n_in, n_out) in layer_sizes(options).items():
+        weight, bias = p[f"{name}.weight"], p[f"{name}.bias"]
+        tiny = options.network == "tiny"
+        # torch's own linear layer is the reference of the small network: the same bounds.
+        bound = 1 / np.sqrt(n_in) if tiny else np.sqrt(6 / (n_in + n_out))
+        if tiny:
+            assert bound == pytest.approx(float(torch.nn.Linear(n_in, 5000).weight.detach().abs().max()), rel=1e-3)
+        assert 0.9 * bound < float(weight.abs().max()) <= bound
         # Uniform on [-b, b]: variance b^2 / 3, with a standard error of b^2 sqrt(4 / 45 / n).
         error = bound**2 * np.sqrt(4 / 45 / weight.numel())
         assert abs(float(weight.var()) - bound**2 / 3) < 5 * error
-        assert float(p[f"{name}.bias"].abs().max()) == 0.0
+        assert float(bias.abs().max()) <= (bound if tiny else 0.0)
 
 
 def test_blender_frame_is_the_presets_range():

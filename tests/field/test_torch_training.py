@@ -127,7 +127,7 @@ def test_adam_is_adam():
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_a_small_field_learns_a_ball(options):
-    steps = 150
+    steps = 400
     with torch_workers(2) as workers:
         t = training(replace(options, learning_rate=5e-3, final_learning_rate=5e-3), workers)
         state, curve = train(t, t.start(), budget_s=None, max_steps=steps)

@@ -89,11 +89,11 @@ def test_train_on_a_blender_folder(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
     stages = []
-    metrics = train_run(source, out, budget_s=None, max_steps=60, threads=1, on_stage=stages.append)
+    metrics = train_run(source, out, budget_s=None, max_steps=160, threads=1, on_stage=stages.append)
     assert metrics == json.loads((out / "metrics.json").read_text())
     assert stages == ["reading photos", "training", "rendering held-out views"]
     assert set(metrics["views"]) == {"r_0", "r_1"}
-    assert metrics["steps"] == 60
+    assert metrics["steps"] == 160
     assert "8-bit" in metrics["protocol"]
     assert "2 held-out views of 20x16 pixels" in metrics["protocol"]
     # The numbers are those of the written images against the photos on white.
@@ -109,7 +109,7 @@ def test_train_on_a_blender_folder(tmp_path):
         assert metrics[key] == pytest.approx(np.mean([view[key] for view in metrics["views"].values()]))
     assert metrics["psnr"] > 16
     curve = json.loads((out / "curve.json").read_text())
-    assert [point["step"] for point in curve] == list(range(1, 61))
+    assert [point["step"] for point in curve] == list(range(1, 161))
     assert set(curve[0]) == {"step", "seconds", "loss", "psnr"}
     assert curve[-1]["psnr"] > curve[0]["psnr"]
     assert metrics["seconds"] == curve[-1]["seconds"]

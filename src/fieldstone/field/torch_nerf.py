@@ -53,14 +53,22 @@ def network_size(options: TrainOptions) -> int:
 
 
 def initial_parameters(options: TrainOptions, rng: np.random.Generator) -> Float[np.ndarray, "p"]:
-    """Weights uniform in +-sqrt(6 / (inputs + outputs)), biases zero; float32.
+    """Random weights and biases; float32.
+
+    tiny: both uniform in +-1 / sqrt(inputs), which is what torch, and so the course, starts from. (From weights 1.7
+    times as large, its learning rate of 0.005 swings from photo to photo and learns nothing in the first 80 steps.)
+    nerf: weights uniform in +-sqrt(6 / (inputs + outputs)), biases zero, as the authors' program.
 
     Drawn with numpy, so that a seed means the same network on every device and version of torch.
     """
     parts = []
     for n_in, n_out in layer_sizes(options).values():
-        bound = math.sqrt(6.0 / (n_in + n_out))
-        parts += [rng.uniform(-bound, bound, n_in * n_out), np.zeros(n_out)]
+        if options.network == "tiny":
+            bound = 1.0 / math.sqrt(n_in)
+            parts += [rng.uniform(-bound, bound, n_in * n_out), rng.uniform(-bound, bound, n_out)]
+        else:
+            bound = math.sqrt(6.0 / (n_in + n_out))
+            parts += [rng.uniform(-bound, bound, n_in * n_out), np.zeros(n_out)]
     return np.concatenate(parts).astype(np.float32)
 
 
