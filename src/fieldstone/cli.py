@@ -263,7 +263,6 @@ def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: in
         record, metrics = run_demo(
             out,
             options,
-            field="tiny",
             budget_s=_seconds(budget),
             on_stage=status.update,
             on_step=lambda p: status.update(f"training: {p.seconds:.0f} s, step {p.step}, PSNR {p.psnr:.2f} dB"),

@@ -18,7 +18,8 @@ DESCRIPTOR_SCALE = 512.0
 class SiftOptions:
     """What counts as a feature, and how many are kept."""
 
-    max_features: int = 8192
+    max_features: int = 5000
+    """More give no better poses on textured photos, and matching costs their square."""
     max_image_size: int = 1600
     """Photos whose longer side has more pixels are reduced to this before detection."""
     contrast_threshold: float = 0.02

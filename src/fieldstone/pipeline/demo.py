@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from fieldstone.field.training import OnStep
 from fieldstone.io.atomic import write_json
 from fieldstone.io.colmap import find_colmap_model, read_colmap
-from fieldstone.pipeline.fields import FieldName, OnStep, train_run
+from fieldstone.pipeline.fast_fields import train_fast_run
 from fieldstone.pipeline.material import OnStage
 from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct
-from fieldstone.report.summary import write_report
 from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.synthetic.photos import PhotoOptions, make_photos, write_photos
@@ -22,7 +22,6 @@ def run_demo(
     out: Path,
     options: ReconstructOptions,
     *,
-    field: FieldName,
     budget_s: float,
     photo_options: PhotoOptions | None = None,
     on_stage: OnStage = lambda stage: None,
@@ -44,17 +43,15 @@ def run_demo(
     if find_colmap_model(out) is not None:
         record["truth"] = errors_against_truth(read_colmap(out), photos.truth)
         write_json(out / "run.json", record)
-    metrics = train_run(
+    metrics = train_fast_run(
         out,
         out,
-        field=field,
         budget_s=budget_s,
         seed=options.seed,
         threads=threads,
         on_step=on_step,
         on_stage=on_stage,
     )
-    write_report(out)
     return record, metrics
 
 

@@ -39,6 +39,7 @@ from fieldstone.pipeline.fields import (
     resume_or_start,
     run_header,
     scene_tensors,
+    write_field_report,
 )
 
 logger = logging.getLogger(__name__)
@@ -133,6 +134,7 @@ def train_fast_run(
         "version": __version__,
     }
     write_json(out / METRICS, metrics)
+    write_field_report(out, dataset, curve, metrics)
     return metrics
 
 
