@@ -6,6 +6,7 @@ from fieldstone.field.fast_decoder import decoder_width, initial_decoder
 from fieldstone.field.fast_field import FastField
 from fieldstone.field.fast_grid import grid_layout
 from fieldstone.field.occupancy import full_box
+from fieldstone.field.projection import no_projection
 from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import PosedImage
 from fieldstone.geometry.camera import Camera
@@ -43,7 +44,7 @@ def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
     decoder = initial_decoder(decoder_width(max_levels), rng)
     for weights in decoder:
         weights += rng.normal(scale=0.1, size=weights.shape).astype(np.float32)
-    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False, 0.0)
+    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False, 0.0, no_projection())
 
 
 def random_rays(rng, field, count):

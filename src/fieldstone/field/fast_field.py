@@ -23,6 +23,7 @@ from fieldstone.field.fast_march_numba import (
     march_rays,
 )  # fmt: skip
 from fieldstone.field.occupancy import Occupancy, cell_distances
+from fieldstone.field.projection import Projection, distance_along, project_rays
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, RenderedRays
 from fieldstone.scene.rays import Rays
 
@@ -50,6 +51,8 @@ class FastField:
     unbounded: bool
     near: float
     """Distance from the camera at which rays begin."""
+    projection: Projection
+    """The space that the grids live in."""
 
     @property
     def width(self) -> int:
@@ -99,6 +102,9 @@ class FastField:
             "cells_shape": np.array(self.occupancy.cells.shape, dtype=np.int64),
             "cells_box": np.append(self.occupancy.lower, self.occupancy.cell_size),
             "sampling": np.array([self.raw_offset, self.step_cells, float(self.unbounded), self.near]),
+            "projection": np.array([self.projection.active, self.projection.near, self.projection.depth], np.float32),
+            "projection_R": self.projection.R,
+            "projection_center": self.projection.center,
             **{f"decoder_{name}": value for name, value in self.decoder._asdict().items()},
         }
 
@@ -128,9 +134,12 @@ def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> FastField:
         occupancy = Occupancy(lower_and_size[:3].copy(), float(lower_and_size[3]), cells)
         layout = grid_layout(tensors["extent"], tuple(tensors["resolutions"].tolist()))
         decoder = Decoder(**{name: tensors[f"decoder_{name}"].copy() for name in Decoder._fields})
+        active, near_plane, depth = tensors["projection"]
+        R, center = tensors["projection_R"].copy(), tensors["projection_center"].copy()
+        projection = Projection(bool(active), R, center, np.float32(near_plane), np.float32(depth))
         raw_offset, step_cells, unbounded, near = tensors["sampling"].tolist()
         empty = np.zeros(layout.num_values, dtype=np.float32)
-        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, bool(unbounded), near)
+        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, bool(unbounded), near, projection)
         return expand(field, tensors["grid"])
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"this checkpoint does not hold a fast field ({error}); delete it and train again") from error
@@ -205,8 +214,12 @@ def renderer(
 
     def render_tile(rays: Rays) -> RenderedRays:
         count = len(rays)
-        origins = np.ascontiguousarray(rays.origins, dtype=np.float32)
-        directions = np.ascontiguousarray(rays.directions, dtype=np.float32)
+        views = np.ascontiguousarray(rays.directions, dtype=np.float32)
+        origins, directions, lengths = rays.origins, rays.directions, np.full(count, far)
+        if field.projection.active:
+            origins, directions, lengths = project_rays(field.projection, rays.origins, rays.directions)
+        origins = np.ascontiguousarray(origins, dtype=np.float32)
+        directions = np.ascontiguousarray(directions, dtype=np.float32)
         color, depth = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         opacity = np.empty(count, np.float32)
         samples = room_for_samples(SAMPLES_PER_TILE, width)
@@ -221,14 +234,20 @@ def renderer(
             num_rays, n, _ = march_rays(
                 grid, box, march, o, d, jitter, FOREVER, count - done, width, samples, first, passed
             )
-            decode_directions(field.decoder, d, num_rays, per_ray)
+            decode_directions(field.decoder, views[done:].reshape(-1), num_rays, per_ray)
             decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
             rows = slice(done, done + num_rays)
             composite_numba(
                 samples, num_rays, first, passed, far, background, rgb, color[rows], depth[rows], opacity[rows]
             )
             done += num_rays
-        return RenderedRays(color, depth, opacity)
+        if field.projection.active:
+            # In the projected space a ray ends at its own length; the expected place goes back to a distance.
+            share = np.where(
+                lengths > 0, (depth - (1 - opacity) * far) / np.maximum(lengths, 1e-9) + (1 - opacity), 1.0
+            )
+            depth = np.minimum(distance_along(field.projection, rays.origins, rays.directions, share), far)
+        return RenderedRays(color, depth.astype(np.float32), opacity)
 
     def render(rays: Rays, /) -> RenderedRays:
         rows = [slice(start, start + RAYS_PER_TILE) for start in range(0, len(rays), RAYS_PER_TILE)]

@@ -20,6 +20,9 @@ class RayBatch(NamedTuple):
 
     origins: np.ndarray
     directions: np.ndarray
+    """As marched: in the field's own space."""
+    views: np.ndarray
+    """Directions as the camera looks, for the decoder."""
     target: np.ndarray
     background: np.ndarray
     jitter: np.ndarray
@@ -64,7 +67,29 @@ def random_share(seed, number):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def draw_rays(table, start, count, seed, background, rays):
+def project_ray_numba(projection, origins, directions, ray):
+    """`projection.project_rays` of one ray, in place, in flat arrays."""
+    o, d = np.empty(3, np.float32), np.empty(3, np.float32)
+    for a in range(3):
+        o[a], d[a] = 0, 0
+        for b in range(3):
+            o[a] += projection.R[a, b] * (origins[ray * 3 + b] - projection.center[b])
+            d[a] += projection.R[a, b] * directions[ray * 3 + b]
+    near = projection.near
+    if d[2] <= np.float32(1e-3):
+        origins[ray * 3], origins[ray * 3 + 1], origins[ray * 3 + 2] = o[0] / near, o[1] / near, 0
+        directions[ray * 3], directions[ray * 3 + 1], directions[ray * 3 + 2] = 0, 0, -1
+        return
+    x, y = (o[0] + (near - o[2]) / d[2] * d[0]) / near, (o[1] + (near - o[2]) / d[2] * d[1]) / near
+    dx, dy, dz = d[0] / d[2] - x, d[1] / d[2] - y, projection.depth
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    origins[ray * 3], origins[ray * 3 + 1], origins[ray * 3 + 2] = x, y, 0
+    directions[ray * 3], directions[ray * 3 + 1], directions[ray * 3 + 2] = dx / length, dy / length, dz / length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def draw_rays(table, projection, start, count, seed, background, rays):
     """Rays number `start` to `start + count` of the table's sequence, with colours over the background."""
     rows = np.uint64(table.image.shape[0])
     scale = np.float32(1.0 / 255.0)
@@ -78,22 +103,27 @@ def draw_rays(table, start, count, seed, background, rays):
             rays.directions[n * 3 + c] = (
                 table.rotations[v, c, 0] * x + table.rotations[v, c, 1] * y + table.rotations[v, c, 2] * z
             )
+            rays.views[n * 3 + c] = rays.directions[n * 3 + c]
             rays.background[n * 3 + c] = background[c]
             color = np.float32(table.rgba[row, c]) * scale
             rays.target[n * 3 + c] = color * alpha + background[c] * (np.float32(1) - alpha)
         rays.jitter[n] = random_share(seed, start + n)
+        if projection.active:
+            project_ray_numba(projection, rays.origins, rays.directions, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def chunk_step(table, start, count, seed, background, grid, box, march, far, decoder, transposed, width, chunk):
+def chunk_step(
+    table, projection, start, count, seed, background, grid, box, march, far, decoder, transposed, width, chunk
+):
     """Gradients of one chunk: of the decoder in chunk.gradient, of the interpolated values in samples.features.
 
     Returns (rays, samples, steps asked, sum of squared colour errors).
     """
     rays, samples, work = chunk.rays, chunk.samples, chunk.work
     used = 4 * grid.per_unit.shape[0]
-    draw_rays(table, start, count, seed, background, rays)
+    draw_rays(table, projection, start, count, seed, background, rays)
     num_rays, n, asked = march_rays(
         grid,
         box,
@@ -108,7 +138,7 @@ def chunk_step(table, start, count, seed, background, grid, box, march, far, dec
         rays.first,
         rays.passed,
     )
-    decode_directions(decoder, rays.directions, num_rays, work.per_ray)
+    decode_directions(decoder, rays.views, num_rays, work.per_ray)
     decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
     loss = composite_backward(
         samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, GRADIENT_SCALE,
@@ -120,7 +150,7 @@ def chunk_step(table, start, count, seed, background, grid, box, march, far, dec
     chunk.gradient.color_weights[:] = 0
     chunk.gradient.color_bias[:] = 0
     decode_backward(
-        decoder, transposed, n, num_rays, samples.features, width, used, samples.ray, rays.directions, work.hidden,
+        decoder, transposed, n, num_rays, samples.features, width, used, samples.ray, rays.views, work.hidden,
         work.d_color, work.d_raw, work.d_per_ray, chunk.gradient,
     )  # fmt: skip
     return num_rays, n, asked, loss

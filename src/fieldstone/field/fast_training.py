@@ -34,6 +34,7 @@ from fieldstone.field.fast_step_numba import chunk_step
 from fieldstone.field.fast_workspace import Workspace, workspace
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
 from fieldstone.field.occupancy_numba import used_cells
+from fieldstone.field.projection import Projection, no_projection, projection_for
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage
 from fieldstone.geometry.rigid3 import Rigid3
@@ -86,6 +87,7 @@ class FastTraining:
     occupancy: Occupancy
     """Where something may be, before training."""
     unbounded: bool
+    projection: Projection
     plan: FastPlan
     seed: int
     executor: Executor
@@ -102,7 +104,7 @@ class FastTraining:
             vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
         near = NEAR_SHARE * self.frame.near if self.unbounded else 0.0
         offset, step = self.plan.raw_offset, self.plan.step_cells
-        field = FastField(layout, table, decoder, self.occupancy, offset, step, self.unbounded, near)
+        field = FastField(layout, table, decoder, self.occupancy, offset, step, self.unbounded, near, self.projection)
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
         rays = np.full(self.plan.num_chunks, self.plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))
@@ -137,8 +139,8 @@ class FastTraining:
 
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
-                self.rays, int(starts[c]), int(state.chunk_rays[c]), self.seed, background, room.grid, room.box,
-                room.march, FOREVER, field.decoder, transposed, field.width, room.chunks[c],
+                self.rays, self.projection, int(starts[c]), int(state.chunk_rays[c]), self.seed, background,
+                room.grid, room.box, room.march, FOREVER, field.decoder, transposed, field.width, room.chunks[c],
             )  # fmt: skip
 
         return list(self.executor.map(chunk, range(len(room.chunks))))
@@ -261,22 +263,28 @@ def fast_training(
     seed: int,
     executor: Executor,
     use_alpha: bool = True,
-    unbounded: bool = False,
+    points_in_world: Float[np.ndarray, "p 3"] | None = None,
 ) -> FastTraining:
     """The training of a fast field on posed photos.
 
     The box is `NORMALIZED_RADIUS` around the origin of the frame. Where photos have alpha, it shrinks to the visual
-    hull; in an unbounded scene, everything beyond the box is contracted into a shell around it.
+    hull. A scene with points is taken as unbounded: photos that look the same way get a projective space, else
+    everything beyond the box is contracted into a shell around it.
 
     Args:
+        points_in_world: Points of a reconstruction.
         use_alpha: False takes photos with alpha as photos on the background of the frame.
 
     Raises:
         InputError: No ray meets the scene.
     """
+    points = np.empty((0, 3)) if points_in_world is None else points_in_world
+    projected = projection_for(images, frame, points) if len(points) else None
+    unbounded = len(points) > 0 and projected is None
     reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
-    occupancy = full_box(np.full(3, -reach), np.full(3, 2.0 * reach), HULL_CELLS // 2)
-    if use_alpha and not unbounded and all(image.pixels.shape[2] == 4 for image in images):
+    projection, bounds = projected or (no_projection(), np.array([[-reach] * 3, [reach] * 3]))
+    occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2)
+    if use_alpha and not len(points) and all(image.pixels.shape[2] == 4 for image in images):
         masks = [image.pixels[:, :, 3] > 0 for image in images]
         if not any(mask.any() for mask in masks):
             raise InputError("all photos are fully transparent: their alpha is 0 everywhere; train without alpha")
@@ -289,8 +297,9 @@ def fast_training(
                 "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
                 "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
             )
-    table = ray_table(images, frame, occupancy_box(occupancy, unbounded), executor, use_alpha=use_alpha)
-    return FastTraining(table, frame, occupancy, unbounded, plan, seed, executor)
+    all_rays = occupancy_box(occupancy, unbounded or projection.active)
+    table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
+    return FastTraining(table, frame, occupancy, unbounded, projection, plan, seed, executor)
 
 
 def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:

@@ -61,7 +61,7 @@ def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder) ->
         part(samples.light, 1), part(samples.ray, 1), part(samples.features, width),
     )  # fmt: skip
     rays = RayBatch(
-        floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(room),
+        floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(room),
         np.zeros(room + 1, dtype=np.int64), floats(room),
     )  # fmt: skip
     work = Work(

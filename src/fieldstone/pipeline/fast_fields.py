@@ -217,7 +217,6 @@ def _open(
     dataset: RayDataset, given: FastPlan | None, budget_s: float, use_alpha: bool, seed: int, executor: Executor
 ) -> FastTraining:
     """The training of a dataset, with the given plan or a provisional one."""
-    unbounded = len(dataset.points_in_world) > 0
     provisional = given or FastPlan(finest=64, steps=(1000,) * 6)
     training = fast_training(
         dataset.train,
@@ -226,17 +225,19 @@ def _open(
         seed=seed,
         executor=executor,
         use_alpha=use_alpha,
-        unbounded=unbounded,
+        points_in_world=dataset.points_in_world,
     )
     if given is not None:
         return training
     world = dataset.frame.normalized_from_world
     distances = [np.linalg.norm(world.apply(image.cam_from_world.target_origin_in_source())) for image in dataset.train]
-    focal = np.median([np.mean(image.camera.focal) for image in dataset.train])
+    focal = float(np.median([np.mean(image.camera.focal) for image in dataset.train]))
     extent = float(np.max(training.occupancy.extent))
     pixel_size = float(np.median(distances) / focal)
+    if training.projection.active:
+        pixel_size = 1.0 / focal
     finest = finest_for(budget_s, extent, pixel_size)
-    if unbounded:
+    if training.unbounded:
         finest = min(2 * finest, MAX_UNBOUNDED)
     return replace(training, plan=replace(provisional, finest=finest))
 

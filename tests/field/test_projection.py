@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from fast_scenes import CAMERA, FRAME
+from fieldstone.field.fast_step_numba import project_ray_numba
+from fieldstone.field.projection import distance_along, project_points, project_rays, projection_for
+from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rotation import exp
+from fieldstone.render.camera_paths import look_at
+from fieldstone.scene.rays import rays_from_view
+
+PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+
+
+def forward_images(rng, count=6):
+    """Cameras side by side that look along z, turned by a few degrees."""
+    return tuple(
+        PosedImage(f"p{k}", CAMERA, Rigid3(exp(rng.normal(scale=0.05, size=3)), rng.normal(scale=0.1, size=3)), PIXELS)
+        for k in range(count)
+    )
+
+
+@pytest.fixture
+def space():
+    rng = np.random.default_rng(0)
+    images = forward_images(rng)
+    points = np.column_stack([rng.uniform(-1, 1, (500, 2)), rng.uniform(2, 9, 500)])
+    found = projection_for(images, FRAME, points)
+    assert found is not None
+    return *found, images
+
+
+def test_points_of_a_ray_stay_on_its_projection(space):
+    projection, _, images = space
+    rays = rays_from_view(images[0].camera, images[0].cam_from_world)
+    start, direction, length = project_rays(projection, rays.origins, rays.directions)
+    for t in (2.5, 7.0, 300.0):
+        points = project_points(projection, rays.origins + t * rays.directions)
+        along = np.einsum("ri,ri->r", points - start, direction)
+        np.testing.assert_allclose(points, start + along[:, None] * direction, atol=1e-6)
+        assert np.all(along < length)
+        np.testing.assert_allclose(
+            distance_along(projection, rays.origins, rays.directions, along / length), t, rtol=1e-4
+        )
+
+
+def test_the_box_holds_all_rays(space):
+    projection, bounds, images = space
+    for image in images:
+        rays = rays_from_view(image.camera, image.cam_from_world)
+        start, direction, length = project_rays(projection, rays.origins, rays.directions)
+        ends = np.concatenate([start, start + length[:, None] * direction])
+        assert np.all(ends >= bounds[0] - 1e-6)
+        assert np.all(ends <= bounds[1] + 1e-6)
+
+
+def test_kernel_matches_reference(space):
+    projection, _, images = space
+    rays = rays_from_view(images[1].camera, images[1].cam_from_world)
+    directions = rays.directions.copy()
+    directions[0] = -directions[0]
+    start, expected, length = project_rays(projection, rays.origins, directions)
+    o, d = rays.origins.astype(np.float32).reshape(-1), directions.astype(np.float32).reshape(-1)
+    for ray in range(len(rays)):
+        project_ray_numba(projection, o, d, ray)
+    np.testing.assert_allclose(d.reshape(-1, 3), expected, atol=1e-5)
+    ahead = length > 0
+    assert not ahead[0]
+    np.testing.assert_allclose(o.reshape(-1, 3)[ahead], start[ahead], atol=1e-4)
+
+
+def test_cameras_around_an_object_get_no_projective_space():
+    up = np.array([0.0, 0, 1])
+    images = tuple(
+        PosedImage(f"{k}", CAMERA, look_at(3 * np.array([np.cos(k), np.sin(k), 0.2]), np.zeros(3), up), PIXELS)
+        for k in range(6)
+    )
+    assert projection_for(images, FRAME, np.random.default_rng(0).normal(size=(100, 3))) is None
+    assert projection_for(images, FRAME, np.empty((0, 3))) is None
