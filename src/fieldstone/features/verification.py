@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,8 +12,6 @@ from jaxtyping import Bool, Float, Int
 from fieldstone.geometry.camera import Camera
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.focal_voting import FocalVote, vote_focal
-from fieldstone.solve.linear_two_view import FundamentalEstimator
-from fieldstone.solve.ransac import RansacOptions, ransac
 from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
 
 MAX_VOTING_PAIRS = 300
@@ -52,15 +51,17 @@ def calibrate_from_pairs(
     """
     pairs = [pair for pair in sorted(graph.matches) if images[pair[0]] and images[pair[1]]]
     pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:MAX_VOTING_PAIRS]
-    center, unit = camera.principal_point, float(max(camera.width, camera.height))
+    unit, (cx, cy) = float(max(camera.width, camera.height)), camera.principal_point
+    pixels_from_unit = np.array([[unit, 0.0, cx], [0.0, unit, cy], [0.0, 0.0, 1.0]])
+    uncalibrated = replace(options, focal_known=False)
 
     def fundamental(pair: ImagePair) -> tuple[Float[np.ndarray, "3 3"], int] | None:
-        pixels1, pixels2 = ((p - center) / unit for p in graph.matched_pixels(pair))
-        ransac_options = RansacOptions(max_error_px=options.ransac.max_error_px / unit, max_trials=2000)
-        found = ransac(FundamentalEstimator(pixels1, pixels2), ransac_options, np.random.default_rng([seed, *pair]))
-        if found is None or found.inliers.sum() < options.min_inliers:
+        pixels1, pixels2 = graph.matched_pixels(pair)
+        rng = np.random.default_rng([seed, *pair])
+        found = estimate_two_view(camera, camera, pixels1, pixels2, uncalibrated, rng)
+        if found.kind != "uncalibrated":  # one plane, or no geometry: nothing about the focal length
             return None
-        return found.model, int(found.inliers.sum())
+        return pixels_from_unit.T @ found.matrix @ pixels_from_unit, int(found.inliers.sum())
 
     with ThreadPoolExecutor(threads) as pool:
         found = [result for result in pool.map(fundamental, pairs) if result is not None]

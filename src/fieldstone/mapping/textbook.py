@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
-from fieldstone.geometry.epipolar import essential_from_fundamental, poses_from_essential
+from fieldstone.geometry.epipolar import essential_from_fundamental, essential_from_pose, poses_from_essential
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.triangulation import choose_by_cheirality, triangulate_linear, triangulation_angles
 from fieldstone.mapping.point_update import drop_outliers, recall_observations, triangulate_new_points
@@ -176,7 +176,9 @@ def four_poses(
     pixels1, pixels2 = graph.matched_pixels(pair, graph.inlier_matches(pair))
     uv1 = plane_from_image(cameras[camera_of_image[pair[0]]], pixels1)
     uv2 = plane_from_image(cameras[camera_of_image[pair[1]]], pixels2)
-    candidates = poses_from_essential(graph.two_views[pair].matrix)
+    two_view = graph.two_views[pair]
+    known = two_view.cam2_from_cam1
+    candidates = poses_from_essential(two_view.matrix if known is None else essential_from_pose(known))
     chosen, in_front = choose_by_cheirality(candidates, uv1, uv2)
     points = tuple(
         triangulate_linear(Rigid3.stack([Rigid3.identity(), pose]), np.stack([uv1, uv2], axis=1)) for pose in candidates
