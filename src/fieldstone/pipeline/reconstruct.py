@@ -136,7 +136,12 @@ def run_record(
         for k, view in enumerate(model.views)
     ]
     photos += [
-        {"name": p.path.name, "registered": False, "verdict": f"not readable: {p.reason}", "points": 0}
+        {
+            "name": p.path.name,
+            "registered": False,
+            "verdict": f"not readable: {p.reason.removeprefix(f'{p.path}: ')}",
+            "points": 0,
+        }
         for p in material.problems
         if p.path.name not in run.verdicts
     ]
