@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from queue import Empty, SimpleQueue
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -187,6 +189,31 @@ def expand(field: FastField, vertices: Float[np.ndarray, "v 4"]) -> FastField:
     return replace(field, table=table)
 
 
+class _Tile(NamedTuple):
+    """Room for one tile of rays; one per thread at work."""
+
+    samples: Samples
+    jitter: np.ndarray
+    first: np.ndarray
+    passed: np.ndarray
+    per_ray: np.ndarray
+    hidden: np.ndarray
+    rgb: np.ndarray
+
+
+def _room_for_tile(width: int) -> _Tile:
+    """Rays begin half a step after the box."""
+    return _Tile(
+        room_for_samples(SAMPLES_PER_TILE, width),
+        np.full(RAYS_PER_TILE, 0.5, np.float32),
+        np.zeros(RAYS_PER_TILE + 1, np.int64),
+        np.empty(RAYS_PER_TILE, np.float32),
+        np.empty(RAYS_PER_TILE * HIDDEN, np.float32),
+        np.empty(SAMPLES_PER_TILE * HIDDEN, np.float32),
+        np.empty(SAMPLES_PER_TILE * 3, np.float32),
+    )
+
+
 def room_for_samples(capacity: int, width: int) -> Samples:
     """Empty arrays for so many samples."""
 
@@ -212,7 +239,19 @@ def renderer(
     width, used = field.width, 4 * field.layout.num_levels
     far = np.float32(frame.far)
 
+    idle: SimpleQueue[_Tile] = SimpleQueue()
+
     def render_tile(rays: Rays) -> RenderedRays:
+        try:
+            tile = idle.get_nowait()
+        except Empty:
+            tile = _room_for_tile(width)
+        try:
+            return render_with(tile, rays)
+        finally:
+            idle.put(tile)
+
+    def render_with(tile: _Tile, rays: Rays) -> RenderedRays:
         count = len(rays)
         views = np.ascontiguousarray(rays.directions, dtype=np.float32)
         origins, directions, lengths = rays.origins, rays.directions, np.full(count, far)
@@ -222,11 +261,7 @@ def renderer(
         directions = np.ascontiguousarray(directions, dtype=np.float32)
         color, depth = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         opacity = np.empty(count, np.float32)
-        samples = room_for_samples(SAMPLES_PER_TILE, width)
-        jitter, first = np.full(count, 0.5, np.float32), np.zeros(count + 1, np.int64)
-        passed, per_ray = np.empty(count, np.float32), np.empty(count * HIDDEN, np.float32)
-        hidden = np.empty(SAMPLES_PER_TILE * HIDDEN, np.float32)
-        rgb = np.empty(SAMPLES_PER_TILE * 3, np.float32)
+        samples, jitter, first, passed, per_ray, hidden, rgb = tile
         background = np.tile(frame.background.astype(np.float32), count)
         done = 0
         while done < count:

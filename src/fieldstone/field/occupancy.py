@@ -145,7 +145,7 @@ def _pooled(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h2 w2"], i
     height, width = (-(-side // factor) for side in mask.shape)
     padded = np.zeros((height * factor, width * factor), dtype=bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
-    return padded.reshape(height, factor, width, factor).any(axis=(1, 3)), factor
+    return np.any(padded.reshape(height, factor, width, factor), axis=(1, 3)), factor
 
 
 def _summed(masks: Sequence[Bool[np.ndarray, "h w"]]) -> Int[np.ndarray, "v h2 w2"]:

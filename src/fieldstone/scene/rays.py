@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -37,7 +38,10 @@ def rays_from_pixels(camera: Camera, cam_from_world: Rigid3, pixels: Float[np.nd
 
     Pixels at which the distortion has no inverse give nan directions.
     """
-    bearings = bearings_from_image(camera, pixels)
+    return _rays_along(bearings_from_image(camera, pixels), camera, cam_from_world)
+
+
+def _rays_along(bearings: Float[np.ndarray, "r 3"], camera: Camera, cam_from_world: Rigid3) -> Rays:
     directions = bearings @ cam_from_world.R
     origin = cam_from_world.target_origin_in_source()
     # Half a pixel at the focal distance, seen along a ray of length 1 / bearing_z.
@@ -45,6 +49,14 @@ def rays_from_pixels(camera: Camera, cam_from_world: Rigid3, pixels: Float[np.nd
     return Rays(np.broadcast_to(origin, directions.shape).copy(), directions, radius)
 
 
+@lru_cache(maxsize=2)
+def _pixel_bearings(camera: Camera) -> Float[np.ndarray, "n 3"]:
+    """Bearings of all pixels; cameras are compared by identity, as their arrays are never written."""
+    bearings = bearings_from_image(camera, pixel_centers(camera.width, camera.height))
+    bearings.flags.writeable = False
+    return bearings
+
+
 def rays_from_view(camera: Camera, cam_from_world: Rigid3) -> Rays:
     """The rays through all pixel centres of a view, row by row."""
-    return rays_from_pixels(camera, cam_from_world, pixel_centers(camera.width, camera.height))
+    return _rays_along(_pixel_bearings(camera), camera, cam_from_world)
