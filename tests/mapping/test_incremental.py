@@ -1,0 +1,168 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
+from fieldstone.geometry.camera import CAMERA_MODELS, Camera, image_from_cam
+from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.calibration import LADDER, as_model, priors
+from fieldstone.mapping.growth import covering_tracks, retriangulate
+from fieldstone.mapping.self_calibration import _leave_one_out, prediction_errors
+from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.tracks import build_tracks
+from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
+from matchers import assert_reconstruction_near
+
+OFF_CENTER = Camera("PINHOLE", 1000, 750, np.array([800.0, 800.0, 515.0, 366.0]))
+
+
+def scene_of(seed: int = 0, **options) -> SyntheticScene:
+    defaults = {"num_cameras": 8, "num_points": 500, "layout": "arc", "noise_px": 0.5, "camera": OFF_CENTER}
+    return synthesize(SceneOptions(**(defaults | options)), np.random.default_rng(seed))
+
+
+def map_scene(scene: SyntheticScene, cameras, known: bool, seed: int = 0, graph: MatchGraph | None = None):
+    graph = graph or scene.graph
+    camera_of_image = np.zeros(graph.num_images, dtype=np.int64)
+    graph = verify_pairs(graph, cameras, camera_of_image, TwoViewOptions(), seed, 2)
+    return map_automatic(graph, cameras, camera_of_image, np.array([known]), AutomaticOptions(), seed)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_known_cameras_are_placed_among_noise_and_outliers(seed):
+    scene = scene_of(seed, outlier_share=0.4, num_clutter=100)
+    run = map_scene(scene, scene.truth.cameras, known=True, seed=seed)
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.2, relative_distance=0.005)
+    errors = run.reconstruction.reprojection_errors()
+    assert np.sqrt(np.mean(errors**2) / 2) < 0.55
+    assert run.reconstruction.cameras[0] is scene.truth.cameras[0]
+
+
+def test_exact_matches_give_exact_poses():
+    scene = scene_of(noise_px=0.0)
+    run = map_scene(scene, scene.truth.cameras, known=True)
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=1e-4, relative_distance=1e-5)
+
+
+def test_unknown_cameras_are_calibrated_by_their_own_photos():
+    """No EXIF, focal length 800 px, principal point off the centre: by vote, bundle adjustment and the ladder.
+
+    All axes meet in one point here, which is where a vote on fundamental matrices is at its worst.
+    """
+    scene = scene_of(num_points=1500, layout="ring", num_cameras=12, noise_px=0.3)
+    guess = Camera("SIMPLE_PINHOLE", 1000, 750, np.array([1200.0, 500.0, 375.0]))
+    vote = calibrate_from_pairs(scene.graph, guess, np.ones(12, dtype=bool), TwoViewOptions(), 0, 2)
+    assert vote is not None
+    assert 0.5 < vote.ratio * 1000 / 800 < 2
+    voted = replace(guess, params=np.array([vote.ratio * 1000, 500.0, 375.0]))
+    run = map_scene(scene, (voted,), known=False)
+    camera = run.reconstruction.cameras[0]
+    assert abs(camera.focal.mean() - 800) < 2
+    np.testing.assert_allclose(camera.principal_point, [515, 366], atol=2)
+    assert "OPENCV" not in camera.model
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.3, relative_distance=0.005)
+
+
+def test_result_is_the_same_for_any_number_of_threads():
+    scene = scene_of(outlier_share=0.2)
+    camera_of_image = np.zeros(8, dtype=np.int64)
+    runs = []
+    for threads in (1, 3):
+        graph = verify_pairs(scene.graph, scene.truth.cameras, camera_of_image, TwoViewOptions(), 5, threads)
+        known = np.array([False])
+        runs.append(map_automatic(graph, scene.truth.cameras, camera_of_image, known, AutomaticOptions(), 5))
+    first, second = (run.reconstruction for run in runs)
+    np.testing.assert_array_equal(first.points.xyz, second.points.xyz)
+    np.testing.assert_array_equal(first.cameras[0].params, second.cameras[0].params)
+
+
+def test_two_unrelated_scenes_become_two_models():
+    a, b = scene_of(1, num_cameras=6), scene_of(2, num_cameras=4)
+    graph = MatchGraph(
+        tuple(f"a{n}" for n in a.graph.names) + tuple(f"b{n}" for n in b.graph.names),
+        a.graph.keypoints + b.graph.keypoints,
+        a.graph.colors + b.graph.colors,
+        {**a.graph.matches, **{(i + 6, j + 6): rows for (i, j), rows in b.graph.matches.items()}},
+    )
+    run = map_scene(a, a.truth.cameras, known=True, graph=graph)
+    assert run.reconstruction.registered().tolist() == list(range(6))
+    assert [model.registered().tolist() for model in run.others] == [[6, 7, 8, 9]]
+    assert run.verdicts["b" + b.graph.names[0]].startswith("in a model of its own (2 of 2)")
+
+
+def test_photos_that_only_turn_give_no_model_but_verdicts():
+    scene = scene_of(num_cameras=3)
+    truth = scene.truth
+    R = truth.pose_of(0).R
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-2, -2, 4], [2, 2, 9], size=(400, 3)) @ R
+    keypoints = []
+    for k in range(3):
+        turned = points @ R.T @ np.linalg.qr(np.eye(3) + 0.03 * k * rng.normal(size=(3, 3)))[0].T
+        turned[:, 2] = np.abs(turned[:, 2])
+        keypoints.append(image_from_cam(OFF_CENTER, turned))
+    rows = np.stack([np.arange(400)] * 2, axis=1)
+    colors = (np.zeros((400, 3), dtype=np.uint8),) * 3
+    graph = MatchGraph(("x", "y", "z"), tuple(keypoints), colors, {(0, 1): rows, (0, 2): rows, (1, 2): rows})
+    run = map_scene(scene, truth.cameras, known=True, graph=graph)
+    assert len(run.reconstruction.registered()) == 0
+    assert all(verdict.startswith("not registered") for verdict in run.verdicts.values())
+
+
+def exact_model(num_cameras: int = 6) -> tuple[SyntheticScene, WorkingModel]:
+    scene = scene_of(num_cameras=num_cameras, num_points=200, noise_px=0.0, visibility=0.7)
+    tracks, _ = build_tracks(scene.verified_graph())
+    model = WorkingModel.start(scene.truth.cameras, np.zeros(num_cameras, dtype=np.int64), tracks)
+    for view in range(num_cameras):
+        model = model.with_pose(view, scene.truth.pose_of(view))
+    everything = np.ones(len(model.xyz), dtype=bool)
+    return scene, retriangulate(model, everything, max_error_px=2.0, min_angle_deg=0.1)
+
+
+def test_covering_tracks_give_every_view_its_share_and_prefer_long_tracks():
+    _, model = exact_model()
+    chosen = covering_tracks(model, 20)
+    rows = model.used_observations()
+    rows = rows[chosen[model.tracks.point[rows]]]
+    assert np.bincount(model.tracks.view[rows], minlength=6).min() >= 20
+    lengths = np.bincount(model.tracks.point[model.used_observations()], minlength=len(model.xyz))
+    assert lengths[chosen].mean() > lengths[~chosen & model.is_point()].mean()
+    assert covering_tracks(model, 10**6)[model.is_point()].all()
+
+
+def test_predictions_leave_out_exactly_their_target():
+    point = np.array([0, 0, 0, 1, 1, 1, 1])
+    predictions = _leave_one_out(point)
+    for k, target in enumerate(predictions.target):
+        members = predictions.members[predictions.starts[k] : predictions.starts[k + 1]]
+        assert sorted([*members, target]) == np.flatnonzero(point == point[target]).tolist()
+    _, model = exact_model()
+    rows = model.used_observations()
+    lengths = np.bincount(model.tracks.point[rows])
+    rows = rows[lengths[model.tracks.point[rows]] >= 3]
+    found = prediction_errors(model, rows, _leave_one_out(model.tracks.point[rows]))
+    assert np.median(found) < 1e-6
+    shifted = replace(model.tracks, pixels=model.tracks.pixels + np.eye(len(model.tracks))[rows[0]][:, None] * 30.0)
+    worse = prediction_errors(replace(model, tracks=shifted), rows, _leave_one_out(model.tracks.point[rows]))
+    assert worse[0] > 10
+
+
+@pytest.mark.parametrize("step", LADDER, ids=lambda step: f"{step.model} {len(step.free)}")
+def test_a_camera_in_a_richer_model_sees_the_same(step):
+    poor = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 322.0, 238.0]))
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], size=(50, 3))
+    rich = as_model(poor, step.model)
+    np.testing.assert_array_equal(image_from_cam(rich, points), image_from_cam(poor, points))
+    assert step.mask().sum() == len(step.free)
+    assert {prior.param for prior in priors([rich], [step])} == set(np.flatnonzero(step.mask()).tolist())
+
+
+def test_a_model_that_cannot_express_the_distortion_is_refused():
+    camera = Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, -0.05]))
+    assert as_model(camera, "OPENCV").coefficients.tolist() == [0.1, -0.05, 0, 0]
+    with pytest.raises(ValueError, match="cannot express"):
+        as_model(camera, "SIMPLE_RADIAL")
+    assert "SIMPLE_RADIAL" in CAMERA_MODELS
