@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fast_scenes import FRAME, ball_images
+from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.fast_field import compress, expand, field_from_tensors
@@ -14,7 +14,7 @@ from fieldstone.field.fast_training import FastTraining, fast_training
 from fieldstone.field.radiance_field import FieldTraining
 from fieldstone.scene.rays import rays_from_view
 
-PLAN = FastPlan(finest=32, steps=(5, 5, 5, 5, 5, 5), num_chunks=4, samples_per_chunk=512)
+PLAN = FastPlan(finest=32, steps=(5, 5, 5, 5, 4, 3, 2, 1), num_chunks=4, samples_per_chunk=512)
 
 
 def training(executor, plan=PLAN, images=None, **options) -> FastTraining:
@@ -63,7 +63,7 @@ def test_a_stop_does_not_change_a_bit(stop):
 @pytest.mark.parametrize("use_alpha", [True, False])
 def test_a_ball_is_learned_in_seconds(use_alpha):
     images = ball_images(20)
-    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 20))
+    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, plan, images[1:], use_alpha=use_alpha)
         state, report = run(work, work.start(), plan.total_steps)
@@ -76,6 +76,26 @@ def test_a_ball_is_learned_in_seconds(use_alpha):
     center = shown.shape[0] // 2 * image.camera.width + image.camera.width // 2
     assert rendered.opacity[center] > 0.95
     assert rendered.opacity[0] < 0.05
+
+
+def test_a_scene_with_points_is_unbounded():
+    """Cameras around an object, and points: everything beyond the box is contracted into a shell."""
+    images = tuple(
+        replace(image, pixels=image.pixels[..., :3] * (image.pixels[..., 3:] // 255)) for image in ball_images(20)
+    )
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
+    dark = replace(FRAME, background=np.zeros(3))
+    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
+    with ThreadPoolExecutor(2) as executor:
+        work = fast_training(images[1:], dark, plan, seed=0, executor=executor, points_in_world=points)
+        assert work.unbounded
+        state, _ = run(work, work.start(), plan.total_steps)
+        image = images[0]
+        rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
+    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
+    assert psnr(shown, image.composited(dark.background)) > 20.0
+    assert np.all(np.isfinite(rendered.depth))
 
 
 def test_the_field_survives_saving():

@@ -34,7 +34,7 @@ def checkpoint_bytes(folder):
 
 
 def write_plan(path, steps=5):
-    path.write_text(json.dumps({"finest": 32, "steps": [steps] * 6, "num_chunks": 2, "samples_per_chunk": 512}))
+    path.write_text(json.dumps({"finest": 32, "steps": [steps] * 8, "num_chunks": 2, "samples_per_chunk": 512}))
     return path
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from fieldstone.field.fast_grid import level_resolutions
 
-STAGE_SHARES = (0.08, 0.12, 0.2, 0.2, 0.2, 0.2)
-"""Share of the training time of each stage; the last ones have the same, finest resolution."""
+STAGE_SHARES = (0.08, 0.12, 0.2, 0.2, 0.18, 0.12, 0.06, 0.04)
+"""Share of the training time of each stage; late ones are short, so that the last correction leaves little to guess."""
 
-STAGE_HALVINGS = (2, 1, 0, 0, 0, 0)
+STAGE_HALVINGS = (2, 1, 0, 0, 0, 0, 0, 0)
 """How often the finest resolution is halved in each stage."""
 
 COARSEST_LEVEL = 14
@@ -126,7 +126,7 @@ def plan_for_budget(budget_s: float, spent_s: float, seconds_per_step: float, fi
         seconds_per_step: Of a step in the first stage, measured.
     """
     left = max(budget_s - spent_s, 0.05)
-    slower = [1.0, 1.3, 1.7, 1.7, 1.7, 1.7]
+    slower = [1.0, 1.3] + [1.7] * (len(STAGE_SHARES) - 2)
     steps = tuple(
         max(round(left * share / (seconds_per_step * factor)), 1)
         for share, factor in zip(STAGE_SHARES, slower, strict=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
-from fieldstone.field.fast_plan import FastPlan, corrected, finest_for, plan_for_budget, plan_from_json
+from fieldstone.field.fast_plan import STAGE_SHARES, FastPlan, corrected, finest_for, plan_for_budget, plan_from_json
 from fieldstone.field.fast_training import FastState, FastTraining, fast_training
 from fieldstone.field.radiance_field import FieldFrame, in_world
 from fieldstone.field.ray_dataset import PosedImage, RayDataset
@@ -198,7 +198,7 @@ def compile_kernels(executor: Executor) -> None:
     pixels[:3], pixels[:, :3] = 0, 0
     image = PosedImage("compile", camera, Rigid3(np.eye(3), np.array([0.0, 0, 4])), pixels)
     frame = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
-    plan = FastPlan(finest=64, steps=(1, 1, 1, 1, 1, 1), num_chunks=1, samples_per_chunk=256)
+    plan = FastPlan(finest=64, steps=(1,) * len(STAGE_SHARES), num_chunks=1, samples_per_chunk=256)
     training = fast_training((image,), frame, plan, seed=0, executor=executor)
     state = training.start()
     for _ in range(plan.total_steps):
@@ -217,7 +217,7 @@ def _open(
     dataset: RayDataset, given: FastPlan | None, budget_s: float, use_alpha: bool, seed: int, executor: Executor
 ) -> FastTraining:
     """The training of a dataset, with the given plan or a provisional one."""
-    provisional = given or FastPlan(finest=64, steps=(1000,) * 6)
+    provisional = given or FastPlan(finest=64, steps=(1000,) * len(STAGE_SHARES))
     training = fast_training(
         dataset.train,
         dataset.frame,
