@@ -139,6 +139,7 @@ def test_predictions_leave_out_exactly_their_target():
     for k, target in enumerate(predictions.target):
         members = predictions.members[predictions.starts[k] : predictions.starts[k + 1]]
         assert sorted([*members, target]) == np.flatnonzero(point == point[target]).tolist()
+    assert len(_leave_one_out(np.empty(0, dtype=np.int64)).target) == 0
     _, model = exact_model()
     rows = model.used_observations()
     lengths = np.bincount(model.tracks.point[rows])

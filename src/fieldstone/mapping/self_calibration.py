@@ -151,7 +151,7 @@ def _leave_one_out(point: Int[np.ndarray, "u"]) -> _Predictions:
     length = np.bincount(point)[point]
     first = np.searchsorted(point, point)
     target = np.repeat(np.arange(len(point)), length)
-    offset = np.arange(len(target)) - np.repeat(np.concatenate([[0], np.cumsum(length)[:-1]]), length)
+    offset = np.arange(len(target)) - np.repeat(np.concatenate([[0], np.cumsum(length)])[:-1], length)
     members = first[target] + offset
     others = members != target
     return _Predictions(
