@@ -109,6 +109,20 @@ def test_the_field_survives_saving():
     np.testing.assert_array_equal(before.depth, again.depth)
 
 
+def test_samples_stay_in_the_grid_however_often_cells_change_their_size():
+    """Cells that do not divide the box reach beyond it; rays must not follow them out of the grids."""
+    plan = replace(PLAN, finest=37)
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor, plan, use_alpha=False)
+        state = work.start()
+        for _ in range(plan.total_steps):
+            state, _ = work.step(state)
+            layout, positions = state.field.layout, state.workspace.samples.position.reshape(-1, 3)
+            assert np.all(positions <= layout.extent.astype(np.float32))
+            last = (positions[:, None] / layout.spacings[None, :, None]).astype(int) + 1
+            assert np.all(last < layout.sizes[None])
+
+
 def test_unreachable_vertices_are_left_out():
     with ThreadPoolExecutor(1) as executor:
         work = training(executor)

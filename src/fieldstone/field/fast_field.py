@@ -63,7 +63,7 @@ class FastField:
 
     def box(self) -> Box:
         """The occupancy as the kernels take it."""
-        return occupancy_box(self.occupancy, self.unbounded)
+        return occupancy_box(self.occupancy, self.layout.extent, self.unbounded)
 
     def march(self, min_weight: float, min_light: float) -> March:
         """How rays are sampled, with the thresholds of the caller."""
@@ -111,11 +111,15 @@ class FastField:
         }
 
 
-def occupancy_box(occupancy: Occupancy, unbounded: bool) -> Box:
-    """An occupancy as the kernels take it."""
+def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounded: bool) -> Box:
+    """An occupancy as the kernels take it.
+
+    Args:
+        extent: Of the grids: the last cells may reach beyond it, samples must not.
+    """
     return Box(
         occupancy.lower.astype(np.float32),
-        occupancy.extent.astype(np.float32),
+        extent.astype(np.float32),
         cell_distances(occupancy.cells).reshape(-1),
         np.array(occupancy.cells.shape, dtype=np.int64),
         np.float32(occupancy.cell_size),

@@ -193,7 +193,8 @@ class FastTraining:
 
     def _pruned(self, field: FastField, density: float) -> FastField:
         spacing = float(field.layout.spacings[-1])
-        occupancy = field.occupancy.resampled(min(spacing * CELL_VERTICES, field.occupancy.cell_size))
+        cell_size = min(spacing * CELL_VERTICES, field.occupancy.cell_size)
+        occupancy = field.occupancy.resampled(cell_size, field.layout.extent)
         cells = occupancy.cells.copy()
         grid = field.layout.arrays(field.table)
         threshold = np.float32(math.log(density))
@@ -297,7 +298,7 @@ def fast_training(
                 "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
                 "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
             )
-    all_rays = occupancy_box(occupancy, unbounded or projection.active)
+    all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
     return FastTraining(table, frame, occupancy, unbounded, projection, plan, seed, executor)
 

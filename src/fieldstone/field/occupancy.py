@@ -58,9 +58,14 @@ class Occupancy:
         cells = self.cells[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
         return Occupancy(self.lower + low * self.cell_size, self.cell_size, np.ascontiguousarray(cells))
 
-    def resampled(self, cell_size: float) -> Occupancy:
-        """The same box in cells of another size: occupied where a cell of the old ones at its place was."""
-        shape = np.maximum(np.ceil(self.extent / cell_size - 1e-4).astype(np.int64), 1)
+    def resampled(self, cell_size: float, extent: Float[np.ndarray, "3"] | None = None) -> Occupancy:
+        """The same box in cells of another size: occupied where a cell of the old ones at its place was.
+
+        Args:
+            extent: What the new cells have to cover; None: all old cells.
+        """
+        extent = self.extent if extent is None else extent
+        shape = np.maximum(np.ceil(extent / cell_size - 1e-4).astype(np.int64), 1)
         parts = []
         for axis in range(3):
             low = np.floor(np.arange(shape[axis]) * cell_size / self.cell_size + 1e-6).astype(np.int64)
