@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.calibration import CalibrationStep, as_model
-from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, map_incremental
+from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
 from fieldstone.mapping.point_update import drop_outliers
 from fieldstone.mapping.record import Drop, MappingRun, StageRecord
 from fieldstone.mapping.refinement import adjust, refine_until_stable
@@ -104,6 +104,9 @@ def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generato
     model, drops = drop_outliers(model, "end", incremental.max_error_px, options.min_angle_deg)
     model = adjust(model, refinement, calibration, bundle=refinement.final, points=model.is_point())
     model, more = drop_outliers(model, "last adjustment", incremental.max_error_px, options.min_angle_deg)
+    if collapsed(before, model):
+        logger.warning("the last adjustment made the model fall apart: it is left as it had grown")
+        return Finished(before, before, [], trials)
     return Finished(model, before, drops + more, trials)
 
 

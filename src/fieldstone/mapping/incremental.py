@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -22,6 +22,9 @@ from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.ransac import RansacOptions
 
 logger = logging.getLogger(__name__)
+
+KEPT_SHARE = 0.5
+"""A step after which fewer of the points are left is undone."""
 
 
 @dataclass(frozen=True)
@@ -168,28 +171,35 @@ def grow(
                 tried |= {view}
                 failures[view] = result.reason()
                 continue
-            logger.info("registered view %d: %s", view, result.reason())
-            reasons[view] = result.reason()
-            failures.pop(view, None)
+            previous = model
             model = model.with_pose(view, result.cam_from_world)
             model = retriangulate(
                 model, tracks_of_view(model, view), max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg
             )
             size = int(model.registered_mask().sum())
-            if size <= options.refinement.always_global or size >= options.refinement.growth * last_global:
-                model = adjust(model, options.refinement, calibration)
-                touched, last_global = np.ones(len(model.xyz), dtype=bool), size
-                tried = frozenset()  # a better model may take what a worse one could not
+            everything = size <= options.refinement.always_global or size >= options.refinement.growth * last_global
+            if everything:
+                model, touched = adjust(model, options.refinement, calibration), np.ones(len(model.xyz), dtype=bool)
             else:
                 model, touched = adjust_around(model, view, options.refinement)
             model = retriangulate(model, touched, max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg)
+            if collapsed(previous, model):
+                model, tried = previous, tried | {view}
+                failures[view] = f"{result.reason()}, but the model falls apart with it"
+                continue
+            logger.info("registered view %d: %s", view, result.reason())
+            reasons[view] = result.reason()
+            failures.pop(view, None)
+            if everything:
+                last_global, tried = size, frozenset()  # a better model may take what a worse one could not
         everyone = model.registered_mask() | ~free
         if everyone.all():
             break
-        model = refine_until_stable(model, options.refinement, calibration, options.max_error_px, stage.min_angle_deg)
+        refined = refine_until_stable(model, options.refinement, calibration, options.max_error_px, stage.min_angle_deg)
+        model = model if collapsed(model, refined) else refined
     return GrownModel(model, start, reasons, failures, calibration)
 
 
-def with_model(grown: GrownModel, model: WorkingModel) -> GrownModel:
-    """The same story with a refined model."""
-    return replace(grown, model=model)
+def collapsed(before: WorkingModel, after: WorkingModel) -> bool:
+    """Whether a step has cost the model most of its points: what was finished is not given up for it."""
+    return bool(after.is_point().sum() < KEPT_SHARE * before.is_point().sum())
