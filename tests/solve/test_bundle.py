@@ -110,6 +110,17 @@ def test_free_gauge_reaches_the_cost_of_a_held_one_and_can_be_restored():
     assert distances[1] == pytest.approx(distances[0], rel=1e-12)
 
 
+def test_rotations_stay_rotations_over_many_adjustments():
+    """A model that grows is adjusted hundreds of times: rounding must not add up, which it does exponentially where
+    R^T stands for the inverse of an R that is not quite orthonormal."""
+    problem = perturbed(without_refinement(mixed_problem(fixed=False)))
+    problem = replace(problem, cam_from_world=Rigid3(1.0001 * problem.cam_from_world.R, problem.cam_from_world.t))
+    for _ in range(30):
+        problem = bundle_adjust(problem, BundleOptions(max_iterations=2, keep_gauge=True)).problem
+    R = problem.cam_from_world.R
+    np.testing.assert_allclose(R @ np.swapaxes(R, -1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
+
+
 def test_outliers_lose_to_a_robust_loss():
     problem = mixed_problem(noise_px=0.0)
     outliers = np.random.default_rng(5).choice(len(problem.view), 6, replace=False)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.solve.bundle_layout import BundleLayout, lay_out
 from fieldstone.solve.bundle_problem import BundleProblem
 from fieldstone.solve.camera_prior import (
@@ -245,11 +246,13 @@ def _with_values(problem: BundleProblem, layout: BundleLayout, values: Values) -
     """The problem at other values; fixed parts keep their bits."""
     points = np.empty_like(values.points)
     points[layout.point_order] = values.points
+    R, moved = values.R.copy(), layout.listed_view[: layout.num_slots]
+    R[moved] = nearest_rotation(R[moved])  # or the rounding of many adjustments adds up
     cameras = tuple(
         replace(camera, params=row[: len(camera.params)].copy()) if mask.any() else camera
         for camera, row, mask in zip(problem.cameras, values.params, problem.refine, strict=True)
     )
-    return replace(problem, cameras=cameras, cam_from_world=Rigid3(values.R, values.t), points=points)
+    return replace(problem, cameras=cameras, cam_from_world=Rigid3(R, values.t), points=points)
 
 
 def _restore_gauge(adjusted: BundleProblem, before: BundleProblem, view: int) -> BundleProblem:
@@ -264,5 +267,6 @@ def _restore_gauge(adjusted: BundleProblem, before: BundleProblem, view: int) ->
     view_from_new = adjusted.cam_from_world[view]
     cam_from_view = adjusted.cam_from_world @ view_from_new.inverse()
     cam_from_old = Rigid3(cam_from_view.R, scale * cam_from_view.t) @ before.cam_from_world[view]
+    cam_from_old = Rigid3(nearest_rotation(cam_from_old.R), cam_from_old.t)
     points = before.cam_from_world[view].inverse().apply(in_view)
     return replace(adjusted, cam_from_world=cam_from_old, points=points)
