@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -35,6 +35,11 @@ class AutomaticOptions:
     self_calibration: SelfCalibrationOptions = field(default_factory=SelfCalibrationOptions)
     min_angle_deg: float = 1.5
     """Points of the result have two rays that meet at this angle at least."""
+
+    def with_threads(self, threads: int) -> AutomaticOptions:
+        """The same with so many threads, which changes nothing but the time."""
+        refinement = replace(self.incremental.refinement, threads=threads)
+        return replace(self, incremental=replace(self.incremental, refinement=refinement))
 
 
 @dataclass(frozen=True, eq=False)

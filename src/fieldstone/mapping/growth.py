@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fieldstone.geometry.camera import plane_from_image
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.solve.robust_triangulation import triangulate_robust
+from fieldstone.solve.undistortion import plane_from_images
 
 
 def retriangulate(
@@ -52,8 +52,12 @@ def tracks_of_view(model: WorkingModel, view: int) -> Bool[np.ndarray, "t"]:
     return out
 
 
-def covering_tracks(model: WorkingModel, per_view: int) -> Bool[np.ndarray, "t"]:
+def covering_tracks(
+    model: WorkingModel, per_view: int, among: Bool[np.ndarray, "t"] | None = None
+) -> Bool[np.ndarray, "t"]:
     """Points that carry a bundle adjustment: the longest tracks, until every view sees `per_view` of them.
+
+    With `among`, only these tracks are considered.
 
     Every point counts for all its views, so views that share points fill up together. Among tracks of one length the
     order is that of their numbers, which is unrelated to where they lie.
@@ -62,6 +66,8 @@ def covering_tracks(model: WorkingModel, per_view: int) -> Bool[np.ndarray, "t"]
         The idea of `cui2017tracks`: a well-chosen part of the tracks gives the same poses.
     """
     rows = model.used_observations()
+    if among is not None:
+        rows = rows[among[model.tracks.point[rows]]]
     point, view = model.tracks.point[rows], model.tracks.view[rows]
     length = np.bincount(point, minlength=len(model.xyz))
     # Rank the observations of each view by the length of their track: the first `per_view` of a view are needed.
@@ -77,10 +83,5 @@ def covering_tracks(model: WorkingModel, per_view: int) -> Bool[np.ndarray, "t"]
 
 def plane_coordinates(model: WorkingModel, rows: Int[np.ndarray, "u"]) -> Float[np.ndarray, "u 2"]:
     """Ideal coordinates on the plane z = 1 of observations; nan outside the range of the lens model."""
-    uv = np.empty((len(rows), 2))
-    camera_of_row = model.camera_of_view[model.tracks.view[rows]]
-    for c, camera in enumerate(model.cameras):
-        mine = camera_of_row == c
-        if mine.any():
-            uv[mine] = plane_from_image(camera, model.tracks.pixels[rows[mine]])
-    return uv
+    camera = model.camera_of_view[model.tracks.view[rows]]
+    return plane_from_images(model.cameras, camera, model.tracks.pixels[rows])

@@ -119,8 +119,8 @@ def _grow_one(
 ) -> GrownModel | None:
     """The model of the first start that grows beyond its pair; failing that, the best pair that is stable."""
     fallback = None
-    starts = rank_starts(graph, empty, free, stage.min_start_angle_deg, stage.min_start_points)
-    for start in starts[: options.max_starts]:
+    angle, points = stage.min_start_angle_deg, stage.min_start_points
+    for start in rank_starts(graph, empty, free, angle, points, options.max_starts):
         model = start_model(empty, start, stage, options)
         if model is None:
             continue

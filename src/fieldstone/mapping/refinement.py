@@ -15,6 +15,9 @@ from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.solve.bundle import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle_problem import BundleProblem
 
+MIN_OBSERVATIONS_FOR_THREADS = 10_000
+"""Smaller adjustments take less time than threads cost."""
+
 
 @dataclass(frozen=True)
 class RefinementOptions:
@@ -44,6 +47,8 @@ class RefinementOptions:
     """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
     max_rounds: int = 4
     """Rounds of adjustment and triangulation at the end."""
+    threads: int = 1
+    """Threads of an adjustment; results are the same for any number."""
 
 
 Calibration = Sequence[CalibrationStep | None]
@@ -76,7 +81,7 @@ def adjust_around(
     free &= model.registered_mask() & (shared > 0)
     touched = np.zeros(len(model.xyz), dtype=bool)
     touched[model.tracks.point[rows[free[model.tracks.view[rows]]]]] = True
-    points = covering_tracks(model, options.tracks_per_view) & touched
+    points = covering_tracks(model, options.tracks_per_view, touched)
     fixed: Calibration = (None,) * len(model.cameras)
     return _solve(model, points, free, fixed, options, options.growing), touched
 
@@ -123,7 +128,9 @@ def _solve(
 ) -> WorkingModel:
     """Adjust the free views and the points of a mask; other registered views that see these points hold them."""
     problem, registered, ids = bundle_problem(model, points, free, calibration, options.min_views_for_intrinsics)
-    result = bundle_adjust(problem, replace(bundle, camera_priors=priors(problem.cameras, calibration)))
+    threads = options.threads if len(problem.view) >= MIN_OBSERVATIONS_FOR_THREADS else 1
+    bundle = replace(bundle, camera_priors=priors(problem.cameras, calibration), threads=threads)
+    result = bundle_adjust(problem, bundle)
     return model.with_adjusted(result.problem, registered, ids)
 
 

@@ -34,28 +34,39 @@ class Start:
 
 
 def rank_starts(
-    graph: MatchGraph, model: WorkingModel, usable: Sequence[bool] | np.ndarray, min_angle_deg: float, min_points: int
+    graph: MatchGraph,
+    model: WorkingModel,
+    usable: Sequence[bool] | np.ndarray,
+    min_angle_deg: float,
+    min_points: int,
+    count: int,
 ) -> list[Start]:
-    """Pairs of usable photos from which a model can start, best first.
+    """The `count` best pairs of usable photos from which a model can start, best first.
 
     The score is the number of points in front of both cameras times the sine of their median angle, up to
-    BEST_START_ANGLE_DEG: many matches make a stable pose, wide rays make stable points.
+    BEST_START_ANGLE_DEG: many matches make a stable pose, wide rays make stable points. Pairs are looked at in the
+    order of their inliers, until no other can have a better score.
     """
-    starts = []
-    for pair in sorted(graph.two_views):
+    starts: list[Start] = []
+    inliers = {pair: int(two_view.inliers.sum()) for pair, two_view in graph.two_views.items()}
+    best_sine = np.sin(np.deg2rad(BEST_START_ANGLE_DEG))
+    for pair in sorted(inliers, key=lambda pair: (-inliers[pair], pair)):
+        if len(starts) >= count and inliers[pair] * best_sine < starts[count - 1].score:
+            break
         two_view = graph.two_views[pair]
         if two_view.cam2_from_cam1 is None or not (usable[pair[0]] and usable[pair[1]]):
             continue
-        if two_view.kind not in ("calibrated", "planar") or two_view.inliers.sum() < min_points:
+        if two_view.kind not in ("calibrated", "planar") or inliers[pair] < min_points:
             continue
         angles, share = _angles(graph, model, pair, two_view.cam2_from_cam1)
-        num_points = int(share * two_view.inliers.sum())
+        num_points = int(share * inliers[pair])
         if num_points < min_points or np.median(angles) < np.deg2rad(min_angle_deg):
             continue
         median = float(np.median(angles))
         score = num_points * np.sin(min(median, np.deg2rad(BEST_START_ANGLE_DEG)))
         starts.append(Start(pair, two_view.cam2_from_cam1, float(score), num_points, median))
-    return sorted(starts, key=lambda start: (-start.score, start.pair))
+        starts.sort(key=lambda start: (-start.score, start.pair))
+    return starts[:count]
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,8 @@ def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) 
     if mapper == "textbook":
         textbook = replace(options.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
-    return map_automatic(graph, cameras, camera_of_image, material.known, options.incremental, options.seed)
+    automatic = options.incremental.with_threads(options.matching.threads)
+    return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed)
 
 
 def full_size(run: MappingRun, material: Material) -> MappingRun:
