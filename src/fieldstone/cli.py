@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fieldstone.field.training import CurvePoint
-    from fieldstone.pipeline.material import MatchingOptions
+    from fieldstone.pipeline.matching_options import MatchingOptions
 
 # Heavy imports live in the verbs, so that help and usage errors come at once.
 
@@ -43,8 +43,10 @@ def reconstruct(
     max_image_size: int = 1600,
     threads: int = 0,
     seed: int = 0,
+    fresh: bool = False,
 ) -> int:
-    """Camera poses and a point cloud from a folder of photos, or from one with given matches.
+    """Camera poses and a point cloud from a folder of photos, or from one with given matches. Run it again to go on
+    after a stop.
 
     Args:
         source: Folder with photos, or in the course format (calibration.txt, matching*.txt and the photos).
@@ -58,6 +60,7 @@ def reconstruct(
         max_image_size: Longer side of the photos for finding features, in pixels.
         threads: 0 takes all cores. The result is the same for any number.
         seed: Every random number of the run follows from it.
+        fresh: Start from nothing, whatever an earlier run has kept in the output folder.
     """
     from fieldstone.mapping.automatic import AutomaticOptions
     from fieldstone.mapping.self_calibration import SelfCalibrationOptions
@@ -69,7 +72,7 @@ def reconstruct(
     )
     calibration = SelfCalibrationOptions(principal_point=not fix_principal_point)
     incremental = AutomaticOptions(self_calibration=calibration)
-    options = ReconstructOptions(mapper, matching, incremental=incremental, seed=seed)
+    options = ReconstructOptions(mapper, matching, incremental=incremental, seed=seed, fresh=fresh)
     console = _console()
     with console.status("reading") as status:
         record = run(source, out, options, on_stage=status.update)
@@ -87,7 +90,7 @@ def _matching_options(
 ) -> MatchingOptions:
     """How photos are matched, and what is known of their cameras."""
     from fieldstone.features.sift import SiftOptions
-    from fieldstone.pipeline.material import MatchingOptions
+    from fieldstone.pipeline.matching_options import MatchingOptions
 
     numbers = None
     if intrinsics is not None:
@@ -254,7 +257,7 @@ def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: in
         seed: Every random number of the run follows from it.
     """
     from fieldstone.pipeline.demo import run_demo
-    from fieldstone.pipeline.material import MatchingOptions
+    from fieldstone.pipeline.matching_options import MatchingOptions
     from fieldstone.pipeline.reconstruct import ReconstructOptions
 
     console = _console()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -31,6 +31,20 @@ def verify_pairs(
     the seed, i and j alone.
     """
     pairs = sorted(graph.matches)
+    found = two_views_of_pairs(graph, pairs, cameras, camera_of_image, options, seed, threads)
+    return graph.with_two_views(dict(zip(pairs, found, strict=True)))
+
+
+def two_views_of_pairs(
+    graph: MatchGraph,
+    pairs: Sequence[ImagePair],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: TwoViewOptions,
+    seed: int,
+    threads: int,
+) -> Iterator[TwoView]:
+    """Geometry of these pairs, in their order, each as soon as it is known."""
 
     def verify(pair: ImagePair) -> TwoView:
         camera1, camera2 = (cameras[camera_of_image[k]] for k in pair)
@@ -38,7 +52,7 @@ def verify_pairs(
         return estimate_two_view(camera1, camera2, pixels1, pixels2, options, np.random.default_rng([seed, *pair]))
 
     with ThreadPoolExecutor(threads) as pool:
-        return graph.with_two_views(dict(zip(pairs, pool.map(verify, pairs), strict=True)))
+        yield from pool.map(verify, pairs)
 
 
 def calibrate_from_pairs(

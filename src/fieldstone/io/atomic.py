@@ -15,6 +15,9 @@ import numpy as np
 
 from fieldstone.errors import InputError
 
+TEMPORARY_PREFIX = ".writing-"
+"""Of temporary names; the process id follows."""
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -27,7 +30,7 @@ def replacing(path: Path) -> Iterator[Path]:
         InputError: `path` is a folder, or its folder cannot be made.
     """
     _make_folder(path)
-    descriptor, name = tempfile.mkstemp(prefix=".writing-", suffix=path.suffix, dir=path.parent)
+    descriptor, name = tempfile.mkstemp(prefix=_prefix(), suffix=path.suffix, dir=path.parent)
     os.close(descriptor)
     temporary = Path(name)
     try:
@@ -58,7 +61,7 @@ def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
     temporaries: dict[str, Path] = {}
     try:
         for name in contents:
-            descriptor, temporary = tempfile.mkstemp(prefix=".writing-", dir=folder)
+            descriptor, temporary = tempfile.mkstemp(prefix=_prefix(), dir=folder)
             temporaries[name] = Path(temporary)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(contents[name])
@@ -104,6 +107,10 @@ def _make_folder(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{path.parent}: cannot be made, a file has that name; choose another output") from error
+
+
+def _prefix() -> str:
+    return f"{TEMPORARY_PREFIX}{os.getpid()}-"
 
 
 def _umask() -> int:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,51 +13,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.features.matching import MutualRatio
-from fieldstone.features.pairs import PairOptions, choose_pairs
-from fieldstone.features.sift import Sift, SiftOptions
-from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
+from fieldstone.features.pairs import choose_pairs
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.matching_txt import read_course_folder
-from fieldstone.io.photos import PhotoInfo, PhotoProblem, list_photos, read_photo
-from fieldstone.scene.features import Features
-from fieldstone.scene.match_graph import ImagePair, MatchGraph
+from fieldstone.io.photos import PhotoProblem, list_photos, read_photo
+from fieldstone.io.workspace import Workspace
+from fieldstone.pipeline.detection import detect
+from fieldstone.pipeline.matched_pairs import match_pairs, verify
+from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_unknown
+from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
-from fieldstone.solve.two_view import TwoViewOptions
 
 logger = logging.getLogger(__name__)
-
-GUESSED_FOCAL = 1.2
-"""Focal length over the longer side where nothing else is known of it."""
-EARTH_RADIUS_M = 6.371e6
-MIN_VOTE_CONTRAST = 0.1
-"""A vote on the focal length that is flatter than this says nothing."""
 
 OnStage = Callable[[str], None]
 PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
 """Decodes the photo of that name; None if there is none."""
-
-
-@dataclass(frozen=True)
-class MatchingOptions:
-    """From photos to a verified graph."""
-
-    sift: SiftOptions = field(default_factory=SiftOptions)
-    max_ratio: float = 0.8
-    """Ratio test of the matcher."""
-    pairs: PairOptions = field(default_factory=PairOptions)
-    """Which pairs of photos are matched."""
-    two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
-    camera_model: str | None = None
-    """Model of given intrinsics; None: PINHOLE for four numbers, SIMPLE_PINHOLE for three."""
-    intrinsics: tuple[float, ...] | None = None
-    """Parameters of the model, in pixels of the stored photo; None: from EXIF, or from the photos themselves."""
-    fix_intrinsics: bool = False
-    """Given intrinsics are exact."""
-    single_camera: bool = False
-    """All photos share one camera, whatever their EXIF says."""
-    threads: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Results are the same for any number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +80,9 @@ def read_course(folder: Path) -> Material:
     )
 
 
-def match_photos(folder: Path, options: MatchingOptions, seed: int, on_stage: OnStage) -> Material:
+def match_photos(
+    folder: Path, options: MatchingOptions, seed: int, on_stage: OnStage, workspace: Workspace
+) -> Material:
     """Features of every photo, matches of every pair, focal lengths where nobody knows them, two-view geometry.
 
     Raises:
@@ -118,20 +90,20 @@ def match_photos(folder: Path, options: MatchingOptions, seed: int, on_stage: On
     """
     on_stage("finding features")
     stop, seconds = _stopwatch()
-    found, problems = detect(list_photos(folder), options)
+    photos, problems = detect(list_photos(folder), options, workspace)
     for problem in problems:
         logger.warning("skipped %s: %s", problem.path.name, problem.reason)
-    if len(found) < 2:
+    if len(photos) < 2:
         reasons = "".join(f"; {problem.path.name}: {problem.reason}" for problem in problems[:3])
         raise InputError(
-            f"{folder}: a reconstruction needs at least two readable photos, found {len(found)}{reasons}; add photos"
+            f"{folder}: a reconstruction needs at least two readable photos, found {len(photos)}{reasons}; add photos"
         )
-    infos, features = [info for info, _ in found], [features for _, features in found]
+    infos, features = [photo.info for photo in photos], [photo.features for photo in photos]
     stop("features")
     on_stage("matching")
     cameras, camera_of_image, source = cameras_of_photos(infos, options)
     sizes = tuple((camera.width, camera.height) for camera in cameras)
-    working = tuple(_reduced(camera, options.sift.max_image_size) for camera in cameras)
+    working = tuple(reduced_camera(camera, options.sift.max_image_size) for camera in cameras)
     keypoints = [
         f.keypoints * (np.array([working[c].width, working[c].height]) / sizes[c])
         for f, c in zip(features, camera_of_image.tolist(), strict=True)
@@ -143,39 +115,15 @@ def match_photos(folder: Path, options: MatchingOptions, seed: int, on_stage: On
         positions=gps_positions(infos),
         threads=options.threads,
     )
-    graph = match_features([info.path.name for info in infos], features, keypoints, pairs, options)
+    graph = match_pairs(photos, keypoints, pairs, options, workspace)
     stop("matching")
     on_stage("verifying pairs")
     working = vote_on_unknown(graph, working, camera_of_image, source, options, seed)
-    graph = verify_pairs(graph, working, camera_of_image, options.two_view, seed, options.threads)
+    graph = verify(graph, photos, working, camera_of_image, options, seed, workspace)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
     return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes)
-
-
-def detect(
-    paths: Sequence[Path], options: MatchingOptions
-) -> tuple[list[tuple[PhotoInfo, Features]], list[PhotoProblem]]:
-    """Features of every readable photo, in the order of the paths, and the files that are none.
-
-    Decoding and extraction release the interpreter lock. A photo is let go as soon as its features are known.
-    """
-    extractor = Sift(options.sift)
-
-    def one(path: Path) -> tuple[PhotoInfo, Features] | PhotoProblem:
-        try:
-            photo = read_photo(path)
-        except InputError as error:
-            return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
-        return photo.info, extractor(photo.rgb)
-
-    with ThreadPoolExecutor(options.threads) as pool:
-        results = list(pool.map(one, paths))
-    return (
-        [result for result in results if not isinstance(result, PhotoProblem)],
-        [result for result in results if isinstance(result, PhotoProblem)],
-    )
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
@@ -187,114 +135,6 @@ def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
         return read_photo(by_name[name]).rgb if name in by_name else None
 
     return photo_of
-
-
-def match_features(
-    names: list[str],
-    features: list[Features],
-    keypoints: list[Float[np.ndarray, "_ 2"]],
-    pairs: list[ImagePair],
-    options: MatchingOptions,
-) -> MatchGraph:
-    """Putative matches of the pairs, in their order."""
-    matcher = MutualRatio(options.max_ratio)
-    with ThreadPoolExecutor(options.threads) as pool:
-        matches = list(pool.map(lambda pair: matcher(features[pair[0]], features[pair[1]]), pairs))
-    return MatchGraph(
-        tuple(names),
-        tuple(keypoints),
-        tuple(f.colors for f in features),
-        {pair: rows for pair, rows in zip(pairs, matches, strict=True) if len(rows)},
-    )
-
-
-def gps_positions(infos: Sequence[PhotoInfo]) -> Float[np.ndarray, "n 3"] | None:
-    """Metres east, north and up of the first GPS position, nan without one; None if no photo has any.
-
-    A plane tangent to a sphere: close enough to find neighbours.
-    """
-    places = [info.exif.gps for info in infos]
-    known = [gps for gps in places if gps is not None]
-    if not known:
-        return None
-    origin = known[0]
-    metres_per_degree = np.deg2rad(1.0) * EARTH_RADIUS_M
-    east = metres_per_degree * np.cos(np.deg2rad(origin.latitude_deg))
-    out = np.full((len(infos), 3), np.nan)
-    for row, gps in zip(out, places, strict=True):
-        if gps is not None:
-            row[0] = (gps.longitude_deg - origin.longitude_deg) * east
-            row[1] = (gps.latitude_deg - origin.latitude_deg) * metres_per_degree
-            row[2] = gps.altitude_m or 0.0
-    return out
-
-
-def cameras_of_photos(
-    infos: Sequence[PhotoInfo], options: MatchingOptions
-) -> tuple[tuple[Camera, ...], Int[np.ndarray, "n"], list[str]]:
-    """Cameras, the camera of each photo, and where each camera's focal length comes from: given, exif or guess.
-
-    Photos of one size, EXIF camera and EXIF focal length share a camera.
-    """
-    cameras: list[Camera] = []
-    source: list[str] = []
-    index: dict[tuple, int] = {}
-    camera_of_image = np.empty(len(infos), dtype=np.int64)
-    for k, info in enumerate(infos):
-        exif = (None, None) if options.single_camera else (info.exif.camera, info.exif.focal_px)
-        key = (info.width, info.height, *exif)
-        if key not in index:
-            index[key] = len(cameras)
-            if options.intrinsics is not None:
-                cameras.append(_given_camera(options, info.width, info.height))
-                source.append("given")
-            else:
-                focal = info.exif.focal_px or GUESSED_FOCAL * max(info.width, info.height)
-                params = np.array([focal, info.width / 2, info.height / 2])
-                cameras.append(Camera("SIMPLE_PINHOLE", info.width, info.height, params))
-                source.append("exif" if info.exif.focal_px else "guess")
-        camera_of_image[k] = index[key]
-    return tuple(cameras), camera_of_image, source
-
-
-def vote_on_unknown(
-    graph: MatchGraph,
-    cameras: tuple[Camera, ...],
-    camera_of_image: Int[np.ndarray, "n"],
-    source: list[str],
-    options: MatchingOptions,
-    seed: int,
-) -> tuple[Camera, ...]:
-    """Cameras without any known focal length get the one that the pairs among their photos vote for."""
-    out = list(cameras)
-    for c, camera in enumerate(cameras):
-        if source[c] != "guess":
-            continue
-        vote = calibrate_from_pairs(graph, camera, camera_of_image == c, options.two_view, seed, options.threads)
-        if vote is None or vote.contrast < MIN_VOTE_CONTRAST:
-            logger.warning("focal length unknown, and the photos do not tell it: guessed %.0f px", camera.params[0])
-            continue
-        focal = vote.ratio * max(camera.width, camera.height)
-        logger.info("focal length by vote: %.1f px, contrast %.2f", focal, vote.contrast)
-        out[c] = replace(camera, params=np.array([focal, *camera.principal_point]))
-    return tuple(out)
-
-
-def _given_camera(options: MatchingOptions, width: int, height: int) -> Camera:
-    """The camera of --intrinsics for a photo of this size."""
-    assert options.intrinsics is not None
-    values = np.array(options.intrinsics, dtype=np.float64)
-    model = options.camera_model or ("SIMPLE_PINHOLE" if len(values) == 3 else "PINHOLE")
-    try:
-        return Camera(model, width, height, values)
-    except ValueError as error:
-        raise InputError(f"--intrinsics {','.join(map(str, options.intrinsics))}: {error}") from error
-
-
-def _reduced(camera: Camera, max_image_size: int) -> Camera:
-    """The camera of the photo as reduced for matching."""
-    factor = min(1.0, max_image_size / max(camera.width, camera.height))
-    return rescale(camera, round(camera.width * factor), round(camera.height * factor))
 
 
 def _stopwatch() -> tuple[Callable[[str], None], dict[str, float]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,18 +16,23 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.io.atomic import write_json
 from fieldstone.io.colmap import write_colmap
+from fieldstone.io.lock import sole_writer
 from fieldstone.io.matching_txt import is_course_folder
 from fieldstone.io.ply import write_points
+from fieldstone.io.workspace import Workspace
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
-from fieldstone.pipeline.material import MatchingOptions, Material, OnStage, match_photos, read_course
+from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.pipeline.material import Material, OnStage, match_photos, read_course
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import mapping_figures, thumbnails
 from fieldstone.report.summary import write_report
 from fieldstone.scene.reconstruction import Reconstruction
 
 Mapper = Literal["auto", "textbook", "incremental"]
+UNITS = "units"
+"""Folder below `work/` for what is kept."""
 
 HOW_ERRORS_ARE_COUNTED = (
     "Every error is the distance in pixels between an observed keypoint and the reprojection of its point, taken over "
@@ -48,6 +55,8 @@ class ReconstructOptions:
     incremental: AutomaticOptions = field(default_factory=AutomaticOptions)
     seed: int = 0
     """Every random number of the run follows from it."""
+    fresh: bool = False
+    """Use nothing that an earlier run has kept."""
 
 
 def reconstruct(
@@ -56,28 +65,37 @@ def reconstruct(
     """Reconstruct a folder of photos, or one in the course format, and write everything to `out`.
 
     Writes `sparse/0/` (COLMAP binary; further components in `sparse/1/` and so on), `points.ply`, `figures/`,
-    `run.json` and `report.html`.
+    `run.json` and `report.html`. Features, matches and two-view geometry are kept in `work/` as they are found: a run
+    that was stopped goes on from there when it is started again, and ends with the same bytes.
 
     Returns:
         What `run.json` holds.
 
     Raises:
-        InputError: The folder is no usable input.
+        InputError: The folder is no usable input, or another process writes to `out`.
     """
+    with sole_writer(out) as work:
+        if options.fresh:
+            shutil.rmtree(work / UNITS, ignore_errors=True)
+        return _reconstruct(source, out, options, Workspace(work / UNITS), on_stage)
+
+
+def _reconstruct(
+    source: Path, out: Path, options: ReconstructOptions, workspace: Workspace, on_stage: OnStage
+) -> dict[str, Any]:
     course = is_course_folder(source)
     mapper = options.mapper if options.mapper != "auto" else "textbook" if course else "incremental"
-    material = read_course(source) if course else match_photos(source, options.matching, options.seed, on_stage)
+    if course:
+        material = read_course(source)
+    else:
+        material = match_photos(source, options.matching, options.seed, on_stage, workspace)
     on_stage("mapping")
     start = time.perf_counter()
     run = full_size(run_mapper(mapper, material, options), material)
     seconds = {**material.seconds, "mapping": time.perf_counter() - start}
     on_stage("writing")
     start = time.perf_counter()
-    for k, model in enumerate((run.reconstruction, *run.others)):
-        if len(model.registered()):
-            write_colmap(model, out / "sparse" / str(k))
-    if len(run.reconstruction.points):
-        write_points(run.reconstruction.points, out / "points.ply")
+    write_models(run, out)
     small = thumbnails(run.graph.names, material.photo_of)
     write_figures(out / "figures", "mapping", mapping_figures(run, material.photo_of), small)
     seconds["writing"] = time.perf_counter() - start
@@ -87,6 +105,27 @@ def reconstruct(
     write_json(out / "run.json", record)
     write_report(out)
     return record
+
+
+def write_models(run: MappingRun, out: Path) -> None:
+    """`sparse/0`, `sparse/1`, ... and `points.ply`; the further models of an earlier run in this folder go."""
+    models = [model for model in (run.reconstruction, *run.others) if len(model.registered())]
+    for k, model in enumerate(models):
+        write_colmap(model, out / "sparse" / str(k))
+    for k in range(len(models), _components_of_earlier_run(out)):
+        shutil.rmtree(out / "sparse" / str(k), ignore_errors=True)
+    if len(run.reconstruction.points):
+        write_points(run.reconstruction.points, out / "points.ply")
+    elif (out / "run.json").exists():
+        (out / "points.ply").unlink(missing_ok=True)
+
+
+def _components_of_earlier_run(out: Path) -> int:
+    """How many models the run that wrote `run.json` left; 0 without a readable one."""
+    try:
+        return len(json.loads((out / "run.json").read_text(encoding="utf-8"))["components"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
 
 
 def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) -> MappingRun:

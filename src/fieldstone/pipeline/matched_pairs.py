@@ -1,0 +1,87 @@
+"""Pairs of photos to a verified graph; matches and geometry are kept as they are found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from fieldstone import __version__
+from fieldstone.features.matching import MutualRatio
+from fieldstone.features.verification import two_views_of_pairs
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.workspace import Packing, Unit, Workspace, key_of, resumed
+from fieldstone.pipeline.detection import SeenPhoto
+from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
+
+
+def match_pairs(
+    photos: Sequence[SeenPhoto],
+    keypoints: Sequence[Float[np.ndarray, "_ 2"]],
+    pairs: Sequence[ImagePair],
+    options: MatchingOptions,
+    workspace: Workspace,
+) -> MatchGraph:
+    """Putative matches of the pairs, in their order; pairs without any are left out.
+
+    Args:
+        keypoints: Of every photo, in working pixels.
+    """
+    matcher = MutualRatio(options.max_ratio)
+
+    def work(some: Sequence[ImagePair]) -> Iterator[Int[np.ndarray, "_ 2"]]:
+        with ThreadPoolExecutor(options.threads) as pool:
+            yield from pool.map(lambda pair: matcher(photos[pair[0]].features, photos[pair[1]].features), some)
+
+    keys = [key_of(__version__, photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
+    packing = Packing(lambda rows: Unit({"rows": rows}), lambda unit: unit.arrays["rows"])
+    matches = resumed(workspace, "matches", keys, pairs, work, packing)
+    return MatchGraph(
+        tuple(photo.info.path.name for photo in photos),
+        tuple(keypoints),
+        tuple(photo.features.colors for photo in photos),
+        {pair: rows for pair, rows in zip(pairs, matches, strict=True) if len(rows)},
+    )
+
+
+def verify(
+    graph: MatchGraph,
+    photos: Sequence[SeenPhoto],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: MatchingOptions,
+    seed: int,
+    workspace: Workspace,
+) -> MatchGraph:
+    """The graph with the geometry of every pair, see `features.verification.verify_pairs`."""
+    pairs = sorted(graph.matches)
+
+    def work(some: Sequence[ImagePair]) -> Iterator[TwoView]:
+        return two_views_of_pairs(graph, some, cameras, camera_of_image, options.two_view, seed, options.threads)
+
+    def key(pair: ImagePair) -> str:
+        used = [cameras[camera_of_image[k]] for k in pair]
+        return key_of(
+            __version__, [photos[k].key for k in pair], options.max_ratio, used, options.two_view, [seed, *pair]
+        )
+
+    packing = Packing(_pack, _unpack)
+    found = resumed(workspace, "two_views", [key(pair) for pair in pairs], pairs, work, packing)
+    return graph.with_two_views(dict(zip(pairs, found, strict=True)))
+
+
+def _pack(two_view: TwoView) -> Unit:
+    arrays = {"matrix": two_view.matrix, "inliers": two_view.inliers}
+    if two_view.cam2_from_cam1 is not None:
+        arrays |= {"R": two_view.cam2_from_cam1.R, "t": two_view.cam2_from_cam1.t}
+    return Unit(arrays, {"kind": two_view.kind})
+
+
+def _unpack(unit: Unit) -> TwoView:
+    arrays = unit.arrays
+    pose = Rigid3(arrays["R"], arrays["t"]) if "R" in arrays else None
+    return TwoView(unit.facts["kind"], arrays["matrix"], pose, arrays["inliers"])
