@@ -26,7 +26,7 @@ from fieldstone.mapping.textbook import TextbookOptions, map_textbook
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import Material, OnStage, match_photos, read_course
 from fieldstone.report.figure_store import write_figures
-from fieldstone.report.figures import mapping_figures, thumbnails
+from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -96,8 +96,9 @@ def _reconstruct(
     on_stage("writing")
     start = time.perf_counter()
     write_models(run, out)
-    small = thumbnails(run.graph.names, material.photo_of)
-    write_figures(out / "figures", "mapping", mapping_figures(run, material.photo_of), small)
+    photo_of = shrunk(material.photo_of)
+    small = thumbnails(run.graph.names, photo_of)
+    write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small)
     seconds["writing"] = time.perf_counter() - start
     record = run_record(source, mapper, run, material, options.seed, seconds)
     # Relative, so that the two folders may move together.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,14 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.report import chart_figures, model_figures, photo_figures
 from fieldstone.report.figure_store import ReportFigure
-from fieldstone.report.theme import evenly, small
+from fieldstone.report.theme import DRAWN_PX, evenly, small
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 PhotoByName = Callable[[str], UInt8[np.ndarray, "_ _ 3"] | None]
 """Gives the pixels of a photo, None if they are not at hand; called when a figure is drawn, so that few are held."""
+
+KEPT_PHOTOS = 32
+"""Small photos that are held in case another figure shows them too."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,17 @@ def field_figures(
             lambda theme: chart_figures.rendered_views_figure(rows, theme=theme),
             on_photos=True,
         )
+
+
+def shrunk(photo_of: PhotoByName) -> PhotoByName:
+    """Photos in the size in which figures show them; the last ones asked for are kept."""
+
+    @lru_cache(maxsize=KEPT_PHOTOS)
+    def shrunk_photo_of(name: str) -> np.ndarray | None:
+        photo = photo_of(name)
+        return None if photo is None else small(photo, DRAWN_PX)
+
+    return shrunk_photo_of
 
 
 def thumbnails(

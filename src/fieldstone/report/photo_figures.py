@@ -21,7 +21,18 @@ from matplotlib.patheffects import Normal, Stroke
 from fieldstone.geometry.camera import Camera, image_from_plane, plane_from_image
 from fieldstone.geometry.epipolar import homogeneous
 from fieldstone.mapping.record import StageRecord
-from fieldstone.report.theme import FONT, LIGHTBOX, PHOTO_DPI, Theme, evenly, label, new_figure, set_title, small
+from fieldstone.report.theme import (
+    DRAWN_PX,
+    FONT,
+    LIGHTBOX,
+    PHOTO_DPI,
+    Theme,
+    evenly,
+    label,
+    new_figure,
+    set_title,
+    small,
+)
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 MaybePhoto = UInt8[np.ndarray, "_ _ 3"] | None
@@ -256,7 +267,7 @@ def _show_photo(axes: Axes, photo: MaybePhoto, extent: tuple[float, float, float
         x, width, height, y = extent[0], extent[1] - extent[0], extent[2] - extent[3], extent[3]
         axes.add_patch(Rectangle((x, y), width, height, facecolor=theme.grid, edgecolor="none"))
     else:
-        dimmed = (small(photo, 1000) * np.float32(0.6)).astype(np.uint8)
+        dimmed = (small(photo, DRAWN_PX) * np.float32(0.6)).astype(np.uint8)
         axes.imshow(dimmed, extent=extent, interpolation="antialiased", aspect="auto", zorder=0)
     axes.set(xlim=limits[0], ylim=limits[1])
 

@@ -27,6 +27,10 @@ FONT = "DejaVu Sans"
 CHART_DPI = 170
 PHOTO_DPI = 125
 JPEG_QUALITY = 80
+PNG_LEVEL = 6
+"""Higher levels take several times as long for a few percent."""
+DRAWN_PX = 1000
+"""Longer side in which figures show photos."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,7 @@ def readable_colors(rgb: UInt8[np.ndarray, "p 3"], theme: Theme) -> Float[np.nda
 def encode_png(figure: Figure) -> bytes:
     """The drawn figure as PNG: the same bytes for the same figure, no date, no program name."""
     buffer = io.BytesIO()
-    Image.fromarray(drawn_pixels(figure)).save(buffer, format="PNG", optimize=True)
+    Image.fromarray(drawn_pixels(figure)).save(buffer, format="PNG", compress_level=PNG_LEVEL)
     return buffer.getvalue()
 
 
