@@ -66,17 +66,20 @@ class Sift:
             # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
             enable_precise_upscale=True,
         )
-        keypoints, descriptors = detector.detectAndCompute(grey, None)
-        if descriptors is None:
+        found = detector.detect(grey, None)
+        if not found:
             return _no_features()
         # OpenCV: centre of the first pixel at (0, 0), diameters, degrees.
-        xy = np.array([k.pt for k in keypoints], dtype=np.float64) + 0.5
-        radius = np.array([k.size for k in keypoints], dtype=np.float64) / 2
-        angle = np.deg2rad(np.array([k.angle for k in keypoints], dtype=np.float64))
-        response = np.array([k.response for k in keypoints], dtype=np.float64)
+        xy = np.array([k.pt for k in found], dtype=np.float64) + 0.5
+        radius = np.array([k.size for k in found], dtype=np.float64) / 2
+        angle = np.deg2rad(np.array([k.angle for k in found], dtype=np.float64))
+        response = np.array([k.response for k in found], dtype=np.float64)
 
         chosen = spread(xy, response, grey.shape, self.options)
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
+        # Only these are described: a second pyramid costs less than thousands of descriptors that nobody needs.
+        kept, descriptors = detector.compute(grey, [found[k] for k in order])
+        assert descriptors is not None and len(kept) == len(order)
         # Each axis of the photo was reduced by its own, rounded, factor.
         zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
         pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
@@ -84,7 +87,7 @@ class Sift:
             keypoints=pixels,
             scale=radius[order] * float(np.sqrt(zoom.prod())),
             angle=angle[order],
-            descriptors=root_sift(descriptors[order]),
+            descriptors=root_sift(np.asarray(descriptors, dtype=np.uint8)),
             colors=colors_at(image, pixels),
         )
 
