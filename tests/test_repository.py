@@ -44,3 +44,8 @@ def test_every_cited_paper_is_in_the_references():
 def test_no_data_file_is_large():
     for path in (ROOT / "tests").rglob("*"):
         assert not path.is_file() or path.stat().st_size < 1_000_000, path
+
+
+def test_no_kernel_may_reorder_its_sums():
+    """A permit makes the last bits depend on which kernels were compiled before, see `solve/block_sums_numba.py`."""
+    assert not [path for path in SOURCES if "fastmath" in path.read_text()]

@@ -15,18 +15,18 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.solve.reprojection_numba import BLOCK, REORDER_SUMS, add_outer_products_numba
+from fieldstone.solve.block_sums_numba import BLOCK, block_sum
+from fieldstone.solve.reprojection_numba import add_outer_products_numba
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def score_block_numba(M, data, begin, end, threshold2):  # -> truncated cost, inliers of data[:, begin:end]
-    """Truncated cost and inliers of some columns, without early rejection."""
+def _score_block(M, data, begin, end, threshold2, costs):  # -> truncated cost, inliers of data[:, begin:end]
+    """`costs` (BLOCK,) is room for those of the matches."""
     m1, m2, m3, m4, m5, m6, m7, m8, m9 = M[0], M[1], M[2], M[3], M[4], M[5], M[6], M[7], M[8]
     x1, y1, x2, y2 = data[0, begin:end], data[1, begin:end], data[2, begin:end], data[3, begin:end]
     v1, v2 = data[4, begin:end], data[5, begin:end]
-    cost = 0.0
-    inliers = 0.0
+    inliers = 0
     for i in range(len(x1)):
         p1 = m1 * x1[i] + m2 * y1[i] + m3
         p2 = m4 * x1[i] + m5 * y1[i] + m6
@@ -37,9 +37,10 @@ def score_block_numba(M, data, begin, end, threshold2):  # -> truncated cost, in
         C2 = C * C
         D = v2[i] * (p1 * p1 + p2 * p2) + v1[i] * (q1 * q1 + q2 * q2)
         good = threshold2 * D > C2
-        cost += C2 / D if good else threshold2
-        inliers += 1.0 if good else 0.0
-    return cost, inliers
+        costs[i] = C2 / D if good else threshold2
+        inliers += 1 if good else 0
+    costs[len(x1) :] = 0.0
+    return block_sum(costs, 0), inliers
 
 
 @njit(cache=True, nogil=True)
@@ -51,9 +52,10 @@ def score_epipolar_numba(M, data, threshold2, max_cost, gain_in, gain_out, log_l
     """
     n = data.shape[1]
     cost, inliers = 0.0, 0.0
+    costs = np.empty(BLOCK)
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
-        block_cost, block_inliers = score_block_numba(M, data, begin, end, threshold2)
+        block_cost, block_inliers = _score_block(M, data, begin, end, threshold2, costs)
         cost += block_cost
         inliers += block_inliers
         log_ratio = inliers * gain_in + (end - inliers) * gain_out
@@ -62,9 +64,9 @@ def score_epipolar_numba(M, data, threshold2, max_cost, gain_in, gain_out, log_l
     return cost, inliers, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _derivatives_block(M, data, begin, end, threshold2, softness, rows):  # fills rows (10 BLOCK,)
+def _derivatives_block(M, data, begin, end, threshold2, softness, rows, costs):  # fills rows (10 BLOCK,)
     """Weighted derivatives of the Sampson error by the entries of M, zero for outliers, then the error.
 
     Rows are pieces of one flat array, so that the loop runs in vectors. Returns cost and inliers.
@@ -73,8 +75,7 @@ def _derivatives_block(M, data, begin, end, threshold2, softness, rows):  # fill
     x1, y1, x2, y2 = data[0, begin:end], data[1, begin:end], data[2, begin:end], data[3, begin:end]
     v1, v2 = data[4, begin:end], data[5, begin:end]
     outlier_cost = threshold2 / (1.0 + softness * threshold2)
-    cost = 0.0
-    inliers = 0.0
+    inliers = 0
     for i in range(len(x1)):
         a1, b1, a2, b2 = x1[i], y1[i], x2[i], y2[i]
         p1, p2, p3 = m1 * a1 + m2 * b1 + m3, m4 * a1 + m5 * b1 + m6, m7 * a1 + m8 * b1 + m9
@@ -84,8 +85,8 @@ def _derivatives_block(M, data, begin, end, threshold2, softness, rows):  # fill
         good = threshold2 * D > C * C
         s2 = 1.0 / (D if good else 1.0)
         weight = 1.0 / (1.0 + softness * C * C * s2)
-        cost += C * C * s2 * weight if good else outlier_cost
-        inliers += 1.0 if good else 0.0
+        costs[i] = C * C * s2 * weight if good else outlier_cost
+        inliers += 1 if good else 0
         s = np.sqrt(s2) * weight if good else 0.0
         # dr/dM = (y x^T - (C / D) (v2 (p1, p2, 0) x^T + v1 y (q1, q2, 0)^T)) / sqrt(D)
         k = C * s2
@@ -101,7 +102,8 @@ def _derivatives_block(M, data, begin, end, threshold2, softness, rows):  # fill
         rows[7 * BLOCK + i] = s * b1 - right2
         rows[8 * BLOCK + i] = s
         rows[9 * BLOCK + i] = C * s
-    return cost, inliers
+    costs[len(x1) :] = 0.0
+    return block_sum(costs, 0), inliers
 
 
 @njit(cache=True, nogil=True)
@@ -117,9 +119,10 @@ def epipolar_normal_equations_numba(M, data, threshold2, softness, rows, S):  # 
         for j in range(10):
             S[i, j] = 0.0
     cost, inliers = 0.0, 0.0
+    costs = np.empty(BLOCK)
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
-        block_cost, block_inliers = _derivatives_block(M, data, begin, end, threshold2, softness, rows)
+        block_cost, block_inliers = _derivatives_block(M, data, begin, end, threshold2, softness, rows, costs)
         cost += block_cost
         inliers += block_inliers
         add_outer_products_numba(rows, end - begin, S)

@@ -10,7 +10,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.solve.epipolar_numba import BLOCK, epipolar_normal_equations_numba
+from fieldstone.solve.block_sums_numba import BLOCK
+from fieldstone.solve.epipolar_numba import epipolar_normal_equations_numba
 from fieldstone.solve.reprojection_numba import MIN_STEP2
 from fieldstone.solve.small_linear_numba import (
     copy_row_numba,

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from fieldstone.solve.block_sums_numba import BLOCK, block_sum
 from fieldstone.solve.null_space_numba import null_space_numba
-from fieldstone.solve.reprojection_numba import BLOCK, MIN_STEP2, REORDER_SUMS, add_outer_products_numba
+from fieldstone.solve.reprojection_numba import MIN_STEP2, add_outer_products_numba
 from fieldstone.solve.small_linear_numba import (
     copy_row_numba,
     multiply3_numba,
@@ -75,9 +76,11 @@ def _area(x, p, q, r):
     return (x[q, 0] - x[p, 0]) * (x[r, 1] - x[p, 1]) - (x[q, 1] - x[p, 1]) * (x[r, 0] - x[p, 0])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _derivatives_block(H, data, begin, end, threshold2, softness, rows):  # fills rows (12 BLOCK,) -> cost, inliers
+def _derivatives_block(
+    H, data, begin, end, threshold2, softness, rows, costs
+):  # fills rows (12 BLOCK,), costs (BLOCK,)
     """Weighted derivatives of the transfer error by the eight entries of D in (I + D) H, D_33 = 0, then the error.
 
     `data` as for a pose (`reprojection_numba`), with the point (x1, y1, 1). u' = u + D_11 u + D_12 v + D_13 -
@@ -88,8 +91,7 @@ def _derivatives_block(H, data, begin, end, threshold2, softness, rows):  # fill
     X, Y = data[2, begin:end], data[3, begin:end]
     w11, w22 = data[5, begin:end], data[7, begin:end]
     outlier_cost = threshold2 / (1.0 + softness * threshold2)
-    cost = 0.0
-    inliers = 0.0
+    inliers = 0
     for i in range(len(X)):
         z = h7 * X[i] + h8 * Y[i] + h9
         h = 1.0 / (z if z > 0.0 else 1.0)
@@ -98,8 +100,8 @@ def _derivatives_block(H, data, begin, end, threshold2, softness, rows):  # fill
         error = r1 * r1 + r2 * r2
         good = (error < threshold2) & (z > 0.0)
         weight = 1.0 / (1.0 + softness * error)
-        cost += error * weight if good else outlier_cost
-        inliers += 1.0 if good else 0.0
+        costs[i] = error * weight if good else outlier_cost
+        inliers += 1 if good else 0
         s = weight if good else 0.0
         p, q = s * w11[i], s * w22[i]
         rows[i] = p * u
@@ -114,7 +116,8 @@ def _derivatives_block(H, data, begin, end, threshold2, softness, rows):  # fill
         rows[9 * BLOCK + i] = -q * u * v
         rows[10 * BLOCK + i] = -q * v * v
         rows[11 * BLOCK + i] = s * r2
-    return cost, inliers
+    costs[len(X) :] = 0.0
+    return block_sum(costs, 0), inliers
 
 
 @njit(cache=True, nogil=True)
@@ -124,9 +127,10 @@ def homography_normal_equations_numba(H, data, threshold2, softness, rows, S):  
     P, Q = np.zeros((6, 6)), np.zeros((6, 6))
     cost, inliers = 0.0, 0.0
     n = data.shape[1]
+    costs = np.empty(BLOCK)
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
-        block_cost, block_inliers = _derivatives_block(H, data, begin, end, threshold2, softness, rows)
+        block_cost, block_inliers = _derivatives_block(H, data, begin, end, threshold2, softness, rows, costs)
         cost += block_cost
         inliers += block_inliers
         add_outer_products_numba(rows[: 6 * BLOCK], end - begin, P)

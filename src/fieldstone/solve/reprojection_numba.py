@@ -14,6 +14,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from fieldstone.solve.block_sums_numba import BLOCK, block_dot, block_sum
 from fieldstone.solve.small_linear_numba import (
     copy_row_numba,
     multiply3_numba,
@@ -22,22 +23,19 @@ from fieldstone.solve.small_linear_numba import (
     squared_length_numba,
 )
 
-BLOCK = 64
 MIN_STEP2 = 1e-22
-# Sums may be reordered so that they run in vector registers; nan and inf keep their meaning.
-REORDER_SUMS = {"reassoc", "contract", "nsz"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _score_block(pose, data, begin, end, threshold2):  # -> truncated cost, inliers of data[:, begin:end]
+def _score_block(pose, data, begin, end, threshold2, costs):  # -> truncated cost, inliers of data[:, begin:end]
+    """`costs` (BLOCK,) is room for those of the points: sums inside the loop would keep it out of vector registers."""
     R11, R12, R13, R21, R22, R23 = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     R31, R32, R33, t1, t2, t3 = pose[6], pose[7], pose[8], pose[9], pose[10], pose[11]
     u, v = data[0, begin:end], data[1, begin:end]
     X, Y, Z = data[2, begin:end], data[3, begin:end], data[4, begin:end]
     w11, w12, w22 = data[5, begin:end], data[6, begin:end], data[7, begin:end]
-    cost = 0.0
-    inliers = 0.0
+    inliers = 0
     for i in range(len(u)):
         x = R11 * X[i] + R12 * Y[i] + R13 * Z[i] + t1
         y = R21 * X[i] + R22 * Y[i] + R23 * Z[i] + t2
@@ -47,9 +45,10 @@ def _score_block(pose, data, begin, end, threshold2):  # -> truncated cost, inli
         r1, r2 = w11[i] * du + w12[i] * dv, w22[i] * dv
         error = r1 * r1 + r2 * r2
         good = (error < threshold2) & (z > 0.0)
-        cost += error if good else threshold2
-        inliers += 1.0 if good else 0.0
-    return cost, inliers
+        costs[i] = error if good else threshold2
+        inliers += 1 if good else 0
+    costs[len(u) :] = 0.0
+    return block_sum(costs, 0), inliers
 
 
 @njit(cache=True, nogil=True)
@@ -65,9 +64,10 @@ def score_pose_numba(pose, data, threshold2, max_cost, gain_in, gain_out, log_li
     """
     n = data.shape[1]
     cost, inliers = 0.0, 0.0
+    costs = np.empty(BLOCK)
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
-        block_cost, block_inliers = _score_block(pose, data, begin, end, threshold2)
+        block_cost, block_inliers = _score_block(pose, data, begin, end, threshold2, costs)
         cost += block_cost
         inliers += block_inliers
         log_ratio = inliers * gain_in + (end - inliers) * gain_out
@@ -76,9 +76,11 @@ def score_pose_numba(pose, data, threshold2, max_cost, gain_in, gain_out, log_li
     return cost, inliers, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _derivatives_block(pose, data, begin, end, threshold2, softness, rows):  # fills rows (14 BLOCK,) -> cost, inliers
+def _derivatives_block(
+    pose, data, begin, end, threshold2, softness, rows, costs
+):  # fills rows (14 BLOCK,), costs (BLOCK,)
     """Weighted derivatives of the first component of the error by the tangent in six rows, then that component;
     then the same for the second component. Rows are pieces of one flat array so that the loop runs in vectors.
     """
@@ -88,8 +90,7 @@ def _derivatives_block(pose, data, begin, end, threshold2, softness, rows):  # f
     X, Y, Z = data[2, begin:end], data[3, begin:end], data[4, begin:end]
     w11, w12, w22 = data[5, begin:end], data[6, begin:end], data[7, begin:end]
     outlier_cost = threshold2 / (1.0 + softness * threshold2)
-    cost = 0.0
-    inliers = 0.0
+    inliers = 0
     for i in range(len(X)):
         z = R31 * X[i] + R32 * Y[i] + R33 * Z[i] + t3
         h = 1.0 / (z if z > 0.0 else 1.0)
@@ -100,8 +101,8 @@ def _derivatives_block(pose, data, begin, end, threshold2, softness, rows):  # f
         error = r1 * r1 + r2 * r2
         good = (error < threshold2) & (z > 0.0)
         weight = 1.0 / (1.0 + softness * error)
-        cost += error * weight if good else outlier_cost
-        inliers += 1.0 if good else 0.0
+        costs[i] = error * weight if good else outlier_cost
+        inliers += 1 if good else 0
         s = weight if good else 0.0
         p, q, m = s * w11[i], s * w12[i], s * w22[i]
         rows[i] = -p * u * v - q * (1.0 + v * v)
@@ -118,7 +119,8 @@ def _derivatives_block(pose, data, begin, end, threshold2, softness, rows):  # f
         rows[11 * BLOCK + i] = m * h
         rows[12 * BLOCK + i] = -m * v * h
         rows[13 * BLOCK + i] = s * r2
-    return cost, inliers
+    costs[len(X) :] = 0.0
+    return block_sum(costs, 0), inliers
 
 
 @njit(cache=True, nogil=True)
@@ -140,9 +142,10 @@ def pose_normal_equations_numba(pose, data, threshold2, softness, rows, S):  # f
             S[i, j] = 0.0
     cost, inliers = 0.0, 0.0
     n = data.shape[1]
+    costs = np.empty(BLOCK)
     for begin in range(0, n, BLOCK):
         end = min(begin + BLOCK, n)
-        block_cost, block_inliers = _derivatives_block(pose, data, begin, end, threshold2, softness, rows)
+        block_cost, block_inliers = _derivatives_block(pose, data, begin, end, threshold2, softness, rows, costs)
         cost += block_cost
         inliers += block_inliers
         add_outer_products_numba(rows[: 7 * BLOCK], end - begin, S)
@@ -150,7 +153,7 @@ def pose_normal_equations_numba(pose, data, threshold2, softness, rows, S):  # f
     return cost, inliers
 
 
-@njit(cache=True, nogil=True, fastmath=REORDER_SUMS)
+@njit(cache=True, nogil=True)
 @no_type_check
 def add_outer_products_numba(rows, count, S):  # (k BLOCK,), (k, k): lower triangle of S += rows rows^T
     """Sum of outer products over one block of columns; columns from `count` on are taken as zero."""
@@ -160,10 +163,7 @@ def add_outer_products_numba(rows, count, S):  # (k BLOCK,), (k, k): lower trian
             rows[i * BLOCK + c] = 0.0
     for i in range(k):
         for j in range(i + 1):
-            s = 0.0
-            for c in range(BLOCK):
-                s += rows[i * BLOCK + c] * rows[j * BLOCK + c]
-            S[i, j] += s
+            S[i, j] += block_dot(rows, i * BLOCK, j * BLOCK)
 
 
 @njit(cache=True, nogil=True)
