@@ -79,7 +79,8 @@ class Sift:
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
         # Only these are described: a second pyramid costs less than thousands of descriptors that nobody needs.
         kept, descriptors = detector.compute(grey, [found[k] for k in order])
-        assert descriptors is not None and len(kept) == len(order)
+        assert descriptors is not None
+        assert len(kept) == len(order)
         # Each axis of the photo was reduced by its own, rounded, factor.
         zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
         pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
