@@ -1,0 +1,230 @@
+"""`transforms.json` of nerfstudio and of instant-ngp: poses, intrinsics and splits in one file.
+
+`transform_matrix` is world_from_camera with OpenGL axes; intrinsics stand at the top or in a frame, which then counts
+more. Pixels have their corner at (0, 0), as ours. The world is the one of the matrices: `applied_transform` says where
+it came from and changes nothing, because `ply_file_path` is in the same world. See docs/conventions.md.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.errors import InputError
+from fieldstone.geometry.camera import Camera
+from fieldstone.io.names import name_problem
+from fieldstone.io.photos import PHOTO_SUFFIXES, natural_key, read_photo_info
+from fieldstone.io.ply import read_points
+from fieldstone.io.posed_photos import PosedPhoto, PosedScene, rigid_from_gl
+
+logger = logging.getLogger(__name__)
+
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+FISHEYE = ("OPENCV_FISHEYE",)
+
+NGP_SCALE = 0.33
+"""instant-ngp multiplies positions by this, unless the file says otherwise, and adds 0.5; its scene is a unit cube."""
+
+
+def find_transforms(source: Path) -> Path | None:
+    """The file that `source` is or holds; None if neither."""
+    if source.is_file() and source.suffix.lower() == ".json":
+        return source
+    inside = source / "transforms.json"
+    return inside if inside.is_file() else None
+
+
+def read_transforms(path: Path) -> PosedScene:
+    """Photos, split, points and box of a file; photos in natural order of their names.
+
+    Frames whose image is missing are left out with a warning.
+
+    Raises:
+        InputError: Not such a file, a pose or an intrinsic is missing or impossible (the message names the frame), or
+            no image is there.
+    """
+    top = _read_json(path)
+    photos: list[PosedPhoto] = []
+    named: dict[str, str] = {}
+    cameras: dict[tuple[Any, ...], Camera] = {}
+    missing: list[str] = []
+    for k, entry in enumerate(top["frames"]):
+        where = f"{path}, frame {k}"
+        file_path = entry.get("file_path") if isinstance(entry, dict) else None
+        if not isinstance(file_path, str):
+            raise InputError(f"{where}: no file_path")
+        image = _image_path(where, path.parent, file_path)
+        where = f"{where} ({file_path})"
+        if image is None:
+            missing.append(file_path)
+            continue
+        name = image.relative_to(path.parent).as_posix()
+        if name in named:
+            raise InputError(f"{where}: the image {name} was named before; remove one of the two frames")
+        named[name] = file_path
+        camera = _camera(where, {**top, **entry}, image, cameras)
+        try:
+            matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)
+            pose = rigid_from_gl(matrix)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{where}: transform_matrix is no camera pose: {error}") from error
+        photos.append(PosedPhoto(name, image, camera, pose, _mask_path(where, path.parent, entry)))
+    if missing:
+        logger.warning("%s: %d of %d images are missing: %s", path, len(missing), len(top["frames"]), missing[0])
+    if not photos:
+        first = f" (the first: {missing[0]})" if missing else ""
+        raise InputError(f"{path}: none of its {len(top['frames'])} images is there{first}; copy them beside it")
+    photos.sort(key=lambda photo: natural_key(photo.name))
+    train, test = _split(path, top, photos, named)
+    points = np.empty((0, 3))
+    if top.get("ply_file_path"):
+        ply = path.parent / str(top["ply_file_path"])
+        if name_problem(str(top["ply_file_path"])) is None and ply.is_file():
+            points = read_points(ply).xyz
+        else:
+            logger.warning("%s: its points %s are missing", path, top["ply_file_path"])
+    return PosedScene(train, test, points, _box(path, top))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(_without_comments(path.read_bytes().decode("utf-8-sig")))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}, byte {error.start}: not UTF-8 text; copy it again") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); copy it again") from error
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: not valid JSON (nested too deeply, or a number too long)") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
+        raise InputError(f"{path}: no list `frames`; is it a transforms.json?")
+    return value
+
+
+def _without_comments(text: str) -> str:
+    """The text without lines that only hold a // comment, which instant-ngp accepts."""
+    return "\n".join("" if line.lstrip().startswith("//") else line for line in text.split("\n"))
+
+
+def _image_path(where: str, folder: Path, file_path: str) -> Path | None:
+    """The image of a frame, with the suffix that the file may have left out."""
+    relative = file_path.replace("\\", "/").removeprefix("./")
+    if problem := name_problem(relative):
+        raise InputError(f"{where}: {problem}")
+    image = folder / relative
+    candidates = [image, *(image.with_name(image.name + suffix) for suffix in PHOTO_SUFFIXES)]
+    return next((c for c in candidates if c.suffix.lower() in PHOTO_SUFFIXES and c.is_file()), None)
+
+
+def _mask_path(where: str, folder: Path, entry: Mapping[str, Any]) -> Path | None:
+    value = entry.get("mask_path")
+    if value is None:
+        return None
+    if not isinstance(value, str) or name_problem(value.removeprefix("./")) is not None:
+        raise InputError(f"{where}: mask_path {value!r} is no path below the folder")
+    return folder / value.removeprefix("./")
+
+
+def _camera(where: str, given: Mapping[str, Any], image: Path, known: dict[tuple[Any, ...], Camera]) -> Camera:
+    """The camera of a frame; equal ones are one object."""
+    info = read_photo_info(image)
+    width = _number(where, given, "w", float(info.width))
+    height = _number(where, given, "h", float(info.height))
+    fx = _focal(where, given, "fl_x", "camera_angle_x", "x_fov", width)
+    fy = _focal(where, given, "fl_y", "camera_angle_y", "y_fov", height) or fx
+    fx = fx or fy
+    if not fx or not fy:
+        raise InputError(f"{where}: no focal length; needs fl_x, camera_angle_x or x_fov")
+    cx, cy = _number(where, given, "cx", 0.5 * width), _number(where, given, "cy", 0.5 * height)
+    model, coefficients = _distortion(where, given)
+    # The image may be a smaller copy: each axis scales by its own factor.
+    sx, sy = info.width / width, info.height / height
+    if abs(sx / sy - 1.0) > 0.02:
+        raise InputError(f"{where}: the image is {info.width}x{info.height}, but w and h say {width:g}x{height:g}")
+    params = (fx * sx, fy * sy, cx * sx, cy * sy, *coefficients)
+    key = (model, info.width, info.height, params)
+    return known.setdefault(key, Camera(model, info.width, info.height, np.array(params)))
+
+
+def _focal(where: str, given: Mapping[str, Any], name: str, radians: str, degrees: str, size: float) -> float | None:
+    """Focal length in pixels; None if the file has none for this axis."""
+    focal = _number(where, given, name, None)
+    if focal is None:
+        angle = _number(where, given, radians, None)
+        if angle is None and (in_degrees := _number(where, given, degrees, None)) is not None:
+            angle = math.radians(in_degrees)
+        if angle is None:
+            return None
+        if not 0 < angle < math.pi:
+            raise InputError(f"{where}: {radians} must lie between 0 and pi, got {angle:g}")
+        focal = 0.5 * size / math.tan(0.5 * angle)
+    if focal <= 0:
+        raise InputError(f"{where}: {name} must be positive, got {focal:g}")
+    return focal
+
+
+def _distortion(where: str, given: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """Camera model and its coefficients; `distortion_params` are k1, k2, k3, k4, p1, p2."""
+    names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    listed = given.get("distortion_params")
+    if listed is not None:
+        if not isinstance(listed, Sequence) or len(listed) != len(names):
+            raise InputError(f"{where}: distortion_params must be the six numbers {', '.join(names)}")
+        given = dict(zip(names, listed, strict=True)) | {key: given[key] for key in ("camera_model",) if key in given}
+    k1, k2, k3, k4, p1, p2 = (float(_number(where, given, name, 0.0) or 0.0) for name in names)
+    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "OPENCV")
+    if model in FISHEYE:
+        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    if model not in PERSPECTIVE:
+        raise InputError(f"{where}: camera model {model!r} cannot be used; needs OPENCV, OPENCV_FISHEYE or PINHOLE")
+    if k3 or k4:
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
+    if k1 or k2 or p1 or p2:
+        return "OPENCV", (k1, k2, p1, p2)
+    return "PINHOLE", ()
+
+
+def _number(where: str, given: Mapping[str, Any], name: str, default: float | None) -> Any:
+    value = given.get(name, default)
+    if value is default:
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {name} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def _split(
+    path: Path, top: Mapping[str, Any], photos: list[PosedPhoto], named: Mapping[str, str]
+) -> tuple[tuple[PosedPhoto, ...], tuple[PosedPhoto, ...] | None]:
+    """By `train_filenames`, `test_filenames` and `val_filenames`, if the file has them."""
+    lists = {key: top.get(f"{key}_filenames") for key in ("train", "test", "val")}
+    if not any(lists.values()):
+        return tuple(photos), None
+    held_out = set(lists["test"] or lists["val"] or ())
+    train = set(lists["train"] or ())
+    tested = tuple(photo for photo in photos if named[photo.name] in held_out)
+    trained = tuple(
+        photo for photo in photos if (named[photo.name] in train if train else named[photo.name] not in held_out)
+    )
+    if not trained:
+        raise InputError(f"{path}: train_filenames names none of the images that are there")
+    return trained, tested
+
+
+def _box(path: Path, top: Mapping[str, Any]) -> Float[np.ndarray, "2 3"] | None:
+    """The unit cube of instant-ngp in the world of the file; None where `aabb_scale` says that there is more."""
+    if top.get("aabb_scale") != 1:
+        return None
+    scale = float(_number(str(path), top, "scale", NGP_SCALE) or NGP_SCALE)
+    offset = np.array(top.get("offset", [0.5, 0.5, 0.5]), dtype=np.float64)
+    if offset.shape != (3,) or not np.isfinite(offset).all() or scale <= 0:
+        raise InputError(f"{path}: scale and offset must be a positive number and three numbers")
+    return np.stack([(0.0 - offset) / scale, (1.0 - offset) / scale])
