@@ -69,7 +69,7 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
     with ThreadPoolExecutor(1) as executor:
         training = fast_training(
             dataset.train, dataset.frame, plan, seed=0, executor=executor, use_alpha=use_alpha,
-            points_in_world=dataset.points_in_world,
+            points_in_world=dataset.points_in_world, bounded=dataset.bounded,
         )  # fmt: skip
         rows, about = kernel_times(training, training.from_tensors(state_tensors))
     show(about)
@@ -109,7 +109,7 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
     def composite() -> None:
         composite_backward(
             samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, np.float32(1e-2),
-            work.d_color, work.d_raw,
+            np.float32(plan.sparsity), work.d_color, work.d_raw,
         )  # fmt: skip
 
     def back() -> None:

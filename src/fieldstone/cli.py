@@ -130,7 +130,8 @@ def train(
     """A radiance field from posed photos, and its held-out views measured. Run it again to go on after a stop.
 
     Args:
-        source: Folder in the Blender format (transforms_train.json), or one that `reconstruct` wrote.
+        source: Folder that `reconstruct` wrote, COLMAP model with its images, Blender or LLFF folder, or
+            transforms.json of nerfstudio or instant-ngp.
         out: Folder for the result: checkpoint.safetensors, metrics.json, curve.json, renders/test.
         field: fast needs seconds to minutes and no torch; tiny is the small network of the course at 100x100, nerf the
             original NeRF at 400x400.

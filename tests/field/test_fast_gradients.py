@@ -17,7 +17,7 @@ ROOM = 4096
 
 
 def forward_and_backward(
-    field, origins, directions, target, background
+    field, origins, directions, target, background, sparsity=0.0
 ) -> tuple[float, Decoder, np.ndarray, Samples, int]:
     """Loss, its gradient by group, and the samples of all rays."""
     count = len(origins)
@@ -45,7 +45,17 @@ def forward_and_backward(
     decode_directions(field.decoder, directions.reshape(-1), count, per_ray)
     decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
     loss = composite_backward(
-        samples, count, first, passed, target.reshape(-1), background.reshape(-1), rgb, np.float32(2), d_color, d_raw
+        samples,
+        count,
+        first,
+        passed,
+        target.reshape(-1),
+        background.reshape(-1),
+        rgb,
+        np.float32(2),
+        np.float32(sparsity),
+        d_color,
+        d_raw,
     )
     gradient = Decoder(*(np.zeros_like(weights) for weights in field.decoder))
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
@@ -76,24 +86,27 @@ def relative_error(actual, expected):
     return np.linalg.norm(actual - expected) / np.linalg.norm(expected)
 
 
-def test_gradients_match_autograd(case):
+@pytest.mark.parametrize("sparsity", [0.0, 0.7])
+def test_gradients_match_autograd(case, sparsity):
     torch = pytest.importorskip("torch")
     from fieldstone.field.torch_field import packed_colors, torch_fast_field
 
     field, _, directions, target, background = case
-    loss, gradient, table, samples, n = forward_and_backward(*case)
+    loss, gradient, table, samples, n = forward_and_backward(*case, sparsity=sparsity)
     twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
-    colors = packed_colors(
-        twin,
+    arguments = (
         torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64)),
         torch.tensor(samples.ray[:n].astype(np.int64)),
         torch.tensor(directions.astype(np.float64)),
-        torch.tensor(background.astype(np.float64)),
-        float(field.march(0.0, 0.0).depth_scale),
     )
+    scale = float(field.march(0.0, 0.0).depth_scale)
+    colors = packed_colors(twin, *arguments, torch.tensor(background.astype(np.float64)), scale)
     squared = ((colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
+    # What a white background adds to a black one is the light that passes.
+    white, black = torch.ones(60, 3, dtype=torch.float64), torch.zeros(60, 3, dtype=torch.float64)
+    passed = (packed_colors(twin, *arguments, white, scale) - packed_colors(twin, *arguments, black, scale))[:, 0]
     parameters = [*(twin.decoder[name] for name in Decoder._fields), *twin.levels]
-    expected = [g.numpy() for g in torch.autograd.grad(squared, parameters)]
+    expected = [g.numpy() for g in torch.autograd.grad(squared + sparsity * (1.0 - passed).sum(), parameters)]
     assert loss == pytest.approx(squared.item(), rel=1e-4)
     for name, of_group in zip(Decoder._fields, expected, strict=False):
         assert relative_error(getattr(gradient, name), of_group) < 1e-4, name

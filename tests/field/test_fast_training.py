@@ -7,12 +7,15 @@ import pytest
 from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_field import compress, expand, field_from_tensors
+from fieldstone.field.fast_field import compress, expand, field_from_tensors, occupancy_box
 from fieldstone.field.fast_plan import FastPlan, corrected, plan_for_budget, plan_from_json
-from fieldstone.field.fast_rays import coprime_stride
+from fieldstone.field.fast_rays import coprime_stride, pixels_that_hit
 from fieldstone.field.fast_training import FastTraining, fast_training
+from fieldstone.field.occupancy import Occupancy
+from fieldstone.field.occupancy_numba import rays_that_hit
 from fieldstone.field.radiance_field import FieldTraining
-from fieldstone.scene.rays import rays_from_view
+from fieldstone.geometry.camera import Camera, bearings_from_image
+from fieldstone.scene.rays import pixel_centers, rays_from_view
 
 PLAN = FastPlan(finest=32, steps=(5, 5, 5, 5, 4, 3, 2, 1), num_chunks=4, samples_per_chunk=512)
 
@@ -88,7 +91,7 @@ def test_a_scene_with_points_is_unbounded():
     dark = replace(FRAME, background=np.zeros(3))
     plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
-        work = fast_training(images[1:], dark, plan, seed=0, executor=executor, points_in_world=points)
+        work = fast_training(images[1:], dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False)
         assert work.unbounded
         state, _ = run(work, work.start(), plan.total_steps)
         image = images[0]
@@ -150,6 +153,46 @@ def test_photos_that_see_nothing_are_refused():
         training(executor, images=images)
 
 
+def test_scouting_finds_the_box_around_the_ball():
+    """Without alpha the box of the start is that of the frame; after one stage it is little more than the ball."""
+    plan = replace(PLAN, finest=64, steps=(120, 3, 1, 1, 1, 1, 1, 1))
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor, plan, ball_images(20), use_alpha=False)
+        state, _ = run(work, work.start(), 121)
+        np.testing.assert_allclose(work.occupancy.extent, 3.0)
+        occupancy = state.field.occupancy
+        lower, upper = occupancy.lower, occupancy.lower + occupancy.extent
+        assert np.all(lower < -RADIUS)
+        assert np.all(upper > RADIUS)
+        assert np.all(upper - lower < 2.6)
+        assert state.step == 121
+        assert state.field.layout.resolutions == plan.levels(1)
+        saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
+        same_tensors(
+            work.to_tensors(run(work, state, 3)[0]), work.to_tensors(run(work, work.from_tensors(saved), 3)[0])
+        )
+
+
+@pytest.mark.parametrize(("focal", "cells"), [(45.0, 12), (200.0, 48), (45.0, 64)])
+def test_no_ray_that_meets_a_cell_is_left_out(focal, cells):
+    """Whole blocks of pixels are tested by one ray; every pixel that would pass on its own is there."""
+    rng = np.random.default_rng(0)
+    occupied = np.zeros((cells,) * 3, dtype=bool)
+    occupied[tuple(rng.integers(2, cells - 2, (3, 40)))] = True
+    occupancy = Occupancy(np.full(3, -1.5), 3.0 / cells, occupied)
+    box = occupancy_box(occupancy, occupancy.extent, False)
+    for image in ball_images(4, Camera("SIMPLE_PINHOLE", 81, 50, np.array([focal, 40.5, 25.0]))):
+        rays = rays_from_view(image.camera, image.cam_from_world)
+        center = rays.origins[0].astype(np.float32)
+        expected = np.zeros(len(rays), dtype=np.uint8)
+        rays_that_hit(box, center, rays.directions.astype(np.float32), expected)
+        bearings = bearings_from_image(image.camera, pixel_centers(81, 50)).astype(np.float32).reshape(50, 81, 3)
+        found = pixels_that_hit(box, center, image.cam_from_world.R.T.astype(np.float32), bearings, focal)
+        assert np.all(found.reshape(-1)[expected > 0])
+        assert 0 < np.count_nonzero(expected) < found.size
+        assert np.count_nonzero(found) < found.size
+
+
 def test_every_row_is_drawn_once_a_round():
     for count in (1, 2, 7, 1000, 4096):
         stride = coprime_stride(count)
@@ -167,9 +210,9 @@ def test_a_plan_survives_json_and_rates_fall():
 
 
 def test_a_budget_is_shared_out_and_corrected():
-    plan = plan_for_budget(10.0, 1.0, 0.01, 64)
+    plan = plan_for_budget(PLAN, 10.0, 1.0, 0.01)
     assert 400 < plan.total_steps < 900
     slower = corrected(plan, 3, 3.0, 0.05)
     assert slower.steps[:3] == plan.steps[:3]
     assert sum(slower.steps[3:]) == pytest.approx(3.0 / 0.05, abs=2)
-    assert min(plan_for_budget(0.1, 5.0, 0.01, 64).steps) == 1
+    assert min(plan_for_budget(PLAN, 0.1, 5.0, 0.01).steps) == 1

@@ -222,9 +222,10 @@ def composite_numba(samples, num_rays, first, passed, far, background, rgb, colo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def composite_backward(samples, num_rays, first, passed, target, background, rgb, scale, d_color, d_raw):
-    """Squared colour errors, summed up, and `scale` times half the gradient of this sum.
+def composite_backward(samples, num_rays, first, passed, target, background, rgb, scale, sparsity, d_color, d_raw):
+    """Squared colour errors, summed up, and `scale` times half the gradient of this sum and the opacities.
 
+    The opacity of a ray, 1 - T_end, counts `sparsity` times: fog in the colour of the background costs nothing else.
     With g = C - target and w_i = T_i alpha_i:  dC / dtau_i = T_(i+1) c_i - sum_{j>i} w_j c_j - T_end background,
     dtau / draw = tau. d_color: (s, 3) gradient before the sigmoid. d_raw: (s).
 
@@ -246,6 +247,7 @@ def composite_backward(samples, num_rays, first, passed, target, background, rgb
         loss += g0 * g0 + g1 * g1 + g2 * g2
         g0, g1, g2 = g0 * scale, g1 * scale, g2 * scale
         behind = left * (background[ray * 3] * g0 + background[ray * 3 + 1] * g1 + background[ray * 3 + 2] * g2)
+        behind -= np.float32(0.5) * scale * sparsity * left
         for i in range(end - 1, start - 1, -1):
             light, alpha = at(samples.light, i), at(samples.alpha, i)
             weight = light * alpha

@@ -42,22 +42,29 @@ class FastPlan:
     samples_per_chunk: int = 1024
     density_rate: float = 0.15
     """Step of a raw density, at the start of training."""
-    feature_rate: float = 0.02
-    decoder_rate: float = 0.005
-    final_rate: float = 0.05
+    feature_rate: float = 0.035
+    decoder_rate: float = 0.02
+    final_rate: float = 0.15
     """Learning rates fall exponentially to this share."""
-    decay: float = 0.95
+    decay: float = 0.98
     """Memory of the mean squared gradients of the grids."""
-    raw_offset: float = -3.0
-    """Raw density of the start: a ray then loses about 5 % of its light per 1/128 of the box."""
+    raw_offset: float = -4.5
+    """Raw density of the start: a ray then loses about 1 % of its light per 1/128 of the box."""
     step_cells: float = 1.0
     """Distance between samples, in cells of the finest level."""
-    min_weight: float = 4e-3
+    min_weight: float = 8e-3
     min_light: float = 1e-2
-    prune_density: float = 0.01
-    """Cells with less than this everywhere are given up."""
+    prune_density: float = 0.05
+    """Cells with less than this everywhere are given up. More than the density of the start: what no ray has asked for
+    by then goes too."""
     immediate_levels: int = 1
     """Finest levels that move sample by sample."""
+    scout: bool = True
+    """The first stage only finds out where something is; then training begins again, in a box around it."""
+    sparsity: float = 2e-3
+    """Weight of the opacity of a ray against its squared colour error."""
+    stop_after: int | None = None
+    """Where training stopped because the time was over, if the machine became slower than any correction foresaw."""
 
     def __post_init__(self) -> None:
         if len(self.steps) != len(STAGE_SHARES) or min(self.steps) < 1:
@@ -67,8 +74,8 @@ class FastPlan:
 
     @property
     def total_steps(self) -> int:
-        """Steps of all stages."""
-        return sum(self.steps)
+        """Steps of all stages, up to the stop."""
+        return min(sum(self.steps), self.stop_after or sum(self.steps))
 
     def to_json(self) -> str:
         """All settings, for `plan_from_json`."""
@@ -114,12 +121,32 @@ def finest_for(budget_s: float, extent: float, pixel_size: float) -> int:
         pixel_size: Width of a pixel at the distance of the scene, in the unit of extent.
     """
     seen = 1.5 * extent / pixel_size
-    affordable = 128.0 * (budget_s / 8.0) ** (1.0 / 3.0)
+    affordable = 160.0 * (budget_s / 8.0) ** (1.0 / 3.0)
     return int(np.clip(min(seen, affordable), 16, MAX_FINEST))
 
 
-def plan_for_budget(budget_s: float, spent_s: float, seconds_per_step: float, finest: int) -> FastPlan:
-    """The plan whose stages take their shares of what is left of a budget.
+LARGE_BATCHES = ((30.0, 2048), (240.0, 4096))
+"""Budgets in seconds from which a chunk has so many samples: the noise of small batches is what long runs end in."""
+
+
+def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
+    """The settings for a kind of scene and a budget, with steps that are still to be planned.
+
+    Args:
+        bounded: The scene is an object in a box. Others fill their space: there is no box to be found around them,
+            and surfaces without texture, which take long to be found, must not be given up early.
+    """
+    steps = (1000,) * len(STAGE_SHARES)
+    room = max([1024, *(samples for from_s, samples in LARGE_BATCHES if budget_s >= from_s)])
+    if bounded:
+        return FastPlan(finest, steps, samples_per_chunk=room)
+    return FastPlan(
+        finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3
+    )
+
+
+def plan_for_budget(plan: FastPlan, budget_s: float, spent_s: float, seconds_per_step: float) -> FastPlan:
+    """The plan with stages that take their shares of what is left of a budget.
 
     Args:
         spent_s: Already gone for reading and preparing.
@@ -131,7 +158,7 @@ def plan_for_budget(budget_s: float, spent_s: float, seconds_per_step: float, fi
         max(round(left * share / (seconds_per_step * factor)), 1)
         for share, factor in zip(STAGE_SHARES, slower, strict=True)
     )
-    return FastPlan(finest=finest, steps=steps)
+    return replace(plan, steps=steps)
 
 
 def corrected(plan: FastPlan, stage: int, left_s: float, seconds_per_step: float) -> FastPlan:

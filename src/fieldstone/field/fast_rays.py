@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fieldstone.errors import InputError
 from fieldstone.field.fast_march_numba import Box
@@ -40,7 +40,7 @@ class RayTable(NamedTuple):
 def ray_table(
     images: tuple[PosedImage, ...], frame: FieldFrame, box: Box, executor: Executor, *, use_alpha: bool = True
 ) -> RayTable:
-    """The table of all pixels whose rays meet an occupied cell (all pixels, if the box is unbounded).
+    """The table of all pixels whose rays meet an occupied cell, and some beside them (all, if the box is unbounded).
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
@@ -59,10 +59,11 @@ def ray_table(
         camera = images[v].camera
         first = first_bearing[id(camera)]
         in_cam = bearings[first : first + camera.width * camera.height]
-        hit = np.ones(len(in_cam), dtype=np.uint8)
+        reached = np.isfinite(in_cam[:, 0])
         if not box.unbounded:
-            rays_that_hit(box, centers[v], np.ascontiguousarray(in_cam @ rotations[v].T), hit)
-        rows = np.flatnonzero((hit > 0) & np.isfinite(in_cam[:, 0]))
+            by_row = in_cam.reshape(camera.height, camera.width, 3)
+            reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
+        rows = np.flatnonzero(reached)
         return (rows + first).astype(np.int32), _rgba(images[v], frame, use_alpha)[rows]
 
     parts = list(executor.map(rows_of, range(len(images))))
@@ -82,6 +83,37 @@ def ray_table(
         centers=centers,
         stride=coprime_stride(total),
     )
+
+
+def pixels_that_hit(
+    box: Box,
+    center: Float[np.ndarray, "3"],
+    rotation: Float[np.ndarray, "3 3"],
+    bearings: Float[np.ndarray, "h w 3"],
+    focal: float,
+) -> Bool[np.ndarray, "h w"]:
+    """At least the pixels whose rays meet an occupied cell of a bounded box.
+
+    Of a square block of pixels, only the ray in the middle is walked, through cells that have grown by one on all
+    sides: a block is at most as wide as a cell is at the far end of the box, so no ray of it strays further.
+
+    Args:
+        center: Of the camera, in the frame of the box.
+        rotation: Box axes from camera axes.
+    """
+    corners = box.lower + box.extent * np.array(list(np.ndindex(2, 2, 2)), dtype=np.float32)
+    farthest = float(np.linalg.norm(corners - center, axis=1).max())
+    block = max(int(np.sqrt(2.0) * float(box.cell_size) * focal / farthest), 1)
+    if block > 1:
+        box = box._replace(distance=np.maximum(box.distance, 1) - np.uint8(1))
+    height, width = bearings.shape[:2]
+    y, x = (np.minimum(np.arange(0, size, block) + block // 2, size - 1) for size in (height, width))
+    middle = bearings[y[:, None], x]
+    hit = np.zeros(len(y) * len(x), dtype=np.uint8)
+    rays_that_hit(box, center, np.ascontiguousarray(middle.reshape(-1, 3) @ rotation.T), hit)
+    hit[~np.isfinite(middle.reshape(-1, 3)[:, 0])] = 1
+    blocks = hit.reshape(len(y), len(x)).astype(bool)
+    return np.repeat(np.repeat(blocks, block, axis=0), block, axis=1)[:height, :width]
 
 
 def coprime_stride(count: int) -> int:

@@ -115,7 +115,21 @@ def draw_rays(table, projection, start, count, seed, background, rays):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def chunk_step(
-    table, projection, start, count, seed, background, grid, box, march, far, decoder, transposed, width, chunk
+    table,
+    projection,
+    start,
+    count,
+    seed,
+    background,
+    grid,
+    box,
+    march,
+    far,
+    sparsity,
+    decoder,
+    transposed,
+    width,
+    chunk,
 ):
     """Gradients of one chunk: of the decoder in chunk.gradient, of the interpolated values in samples.features.
 
@@ -142,7 +156,7 @@ def chunk_step(
     decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
     loss = composite_backward(
         samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, GRADIENT_SCALE,
-        work.d_color, work.d_raw,
+        sparsity, work.d_color, work.d_raw,
     )  # fmt: skip
     chunk.gradient.feature_weights[:] = 0
     chunk.gradient.direction_weights[:] = 0

@@ -49,6 +49,9 @@ CELL_VERTICES = 2
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
 
+MIN_STEPS = 60
+"""No cell is given up before so many steps."""
+
 NEAR_SHARE = 0.5
 """In an unbounded scene, rays begin at this share of the nearest distance of the frame."""
 
@@ -94,22 +97,25 @@ class FastTraining:
 
     def start(self) -> FastState:
         """The state before the first step."""
-        levels = self.plan.levels(len(self.plan.steps) - 1)
-        rng = np.random.default_rng([self.seed, 1])
-        decoder = initial_decoder(decoder_width(len(levels)), rng)
-        layout = grid_layout(self.occupancy.extent, self.plan.levels(0))
+        return self._first_state(self.plan, self.occupancy, stage=0)
+
+    def _first_state(self, plan: FastPlan, occupancy: Occupancy, *, stage: int) -> FastState:
+        """A state that knows nothing but where something may be, on the grids of a stage."""
+        rng = np.random.default_rng([self.seed, 1, stage])
+        decoder = initial_decoder(decoder_width(len(plan.levels(len(plan.steps) - 1))), rng)
+        layout = grid_layout(occupancy.extent, plan.levels(stage))
         table = np.zeros(layout.num_values, dtype=np.float32)
         for level in range(layout.num_levels):
             vertices = layout.level(table, level)
             vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
         near = NEAR_SHARE * self.frame.near if self.unbounded else 0.0
-        offset, step = self.plan.raw_offset, self.plan.step_cells
-        field = FastField(layout, table, decoder, self.occupancy, offset, step, self.unbounded, near, self.projection)
+        offset, step = plan.raw_offset, plan.step_cells
+        field = FastField(layout, table, decoder, occupancy, offset, step, self.unbounded, near, self.projection)
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
-        rays = np.full(self.plan.num_chunks, self.plan.samples_per_chunk // 8, dtype=np.int64)
+        rays = np.full(plan.num_chunks, plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))
         velocity = np.zeros_like(table)
-        return FastState(self.plan, 0, 0, rays, field, velocity, zeros, square, workspace(field, self.plan))
+        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, workspace(field, plan))
 
     def step(self, state: FastState, /) -> tuple[FastState, StepReport]:
         """One step; grids and occupancy change at the steps that the plan says."""
@@ -140,7 +146,8 @@ class FastTraining:
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
                 self.rays, self.projection, int(starts[c]), int(state.chunk_rays[c]), self.seed, background,
-                room.grid, room.box, room.march, FOREVER, field.decoder, transposed, field.width, room.chunks[c],
+                room.grid, room.box, room.march, FOREVER, np.float32(state.plan.sparsity), field.decoder, transposed,
+                field.width, room.chunks[c],
             )  # fmt: skip
 
         return list(self.executor.map(chunk, range(len(room.chunks))))
@@ -183,9 +190,12 @@ class FastTraining:
         into_stage = state.step - sum(plan.steps[:stage])
         prune = into_stage == 0 and stage > 0
         prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
-        if prune:
+        if prune and state.step >= MIN_STEPS:
             field = self._pruned(state.field, plan.prune_density)
             state = replace(state, field=field, workspace=replace(state.workspace, box=field.box()))
+        if plan.scout and stage == 1 and into_stage == 0:
+            found = self._first_state(plan, state.field.occupancy.trimmed(), stage=1)
+            return replace(found, step=state.step, cursor=state.cursor)
         wanted = plan.levels(stage)
         if wanted != state.field.layout.resolutions:
             state = _grown(state, wanted)
@@ -265,27 +275,29 @@ def fast_training(
     executor: Executor,
     use_alpha: bool = True,
     points_in_world: Float[np.ndarray, "p 3"] | None = None,
+    bounded: bool = True,
 ) -> FastTraining:
     """The training of a fast field on posed photos.
 
     The box is `NORMALIZED_RADIUS` around the origin of the frame. Where photos have alpha, it shrinks to the visual
-    hull. A scene with points is taken as unbounded: photos that look the same way get a projective space, else
-    everything beyond the box is contracted into a shell around it.
+    hull. An unbounded scene whose photos look the same way gets a projective space; in others everything beyond the
+    box is contracted into a shell around it.
 
     Args:
-        points_in_world: Points of a reconstruction.
+        points_in_world: Known points, which tell how near things are.
+        bounded: Nothing lies beyond the box.
         use_alpha: False takes photos with alpha as photos on the background of the frame.
 
     Raises:
         InputError: No ray meets the scene.
     """
     points = np.empty((0, 3)) if points_in_world is None else points_in_world
-    projected = projection_for(images, frame, points) if len(points) else None
-    unbounded = len(points) > 0 and projected is None
+    projected = None if bounded else projection_for(images, frame, points)
+    unbounded = not bounded and projected is None
     reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
     projection, bounds = projected or (no_projection(), np.array([[-reach] * 3, [reach] * 3]))
     occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2)
-    if use_alpha and not len(points) and all(image.pixels.shape[2] == 4 for image in images):
+    if use_alpha and bounded and all(image.pixels.shape[2] == 4 for image in images):
         masks = [image.pixels[:, :, 3] > 0 for image in images]
         if not any(mask.any() for mask in masks):
             raise InputError("all photos are fully transparent: their alpha is 0 everywhere; train without alpha")

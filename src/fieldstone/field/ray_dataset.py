@@ -69,6 +69,8 @@ class RayDataset:
     frame: FieldFrame
     points_in_world: Float[np.ndarray, "p 3"]
     """Triangulated points, none where only images and poses are known."""
+    bounded: bool = True
+    """Nothing lies beyond the cube of half side `NORMALIZED_RADIUS` around the origin of the frame."""
 
     def __post_init__(self) -> None:
         if not self.train:
@@ -221,11 +223,7 @@ def blender_frame(near: float = BLENDER_NEAR, far: float = BLENDER_FAR) -> Field
 
 
 def frame_from_points(model: Reconstruction, background: Float[np.ndarray, "3"]) -> FieldFrame:
-    """Frame and range from the triangulated points.
-
-    The median point is moved to the origin and the scale is chosen so that 90 % of the points lie within 1.5. Rays
-    run from 0.8 times the 1st percentile to 1.25 times the 99th percentile of the distances at which the photos
-    observe their points: percentiles, because a single bad point must not stretch the range.
+    """Frame and range from the triangulated points and the photos that observe them; see `frame_from_seen`.
 
     Raises:
         InputError: Fewer than 10 observations of points.
@@ -237,15 +235,43 @@ def frame_from_points(model: Reconstruction, background: Float[np.ndarray, "3"])
             f"the range of a field comes from its points, and only {np.count_nonzero(rows)} observations of points "
             "have a camera pose; run `fieldstone reconstruct` on more photos"
         )
-    center = np.median(model.points.xyz, axis=0)
-    spread = np.percentile(np.linalg.norm(model.points.xyz - center, axis=1), 90)
-    scale = NORMALIZED_RADIUS / max(float(spread), 1e-12)
     camera_centers = np.full((len(model.views), 3), np.nan)
     camera_centers[model.registered()] = model.camera_centers()
     seen = model.points.xyz[model.observations.point[rows]]
-    distances = scale * np.linalg.norm(seen - camera_centers[model.observations.view[rows]], axis=1)
-    near, far = 0.8 * np.percentile(distances, 1), 1.25 * np.percentile(distances, 99)
+    distances = np.linalg.norm(seen - camera_centers[model.observations.view[rows]], axis=1)
+    return frame_from_seen(model.points.xyz, distances, background)
+
+
+def frame_from_seen(
+    points: Float[np.ndarray, "p 3"], distances: Float[np.ndarray, "o"], background: Float[np.ndarray, "3"]
+) -> FieldFrame:
+    """Frame and range from points in the world, and the distances at which photos see them.
+
+    The median point is moved to the origin and the scale is chosen so that 90 % of the points lie within 1.5. Rays
+    run from 0.8 times the 1st percentile to 1.25 times the 99th percentile of the distances: percentiles, because a
+    single bad point must not stretch the range.
+    """
+    center = np.median(points, axis=0)
+    spread = np.percentile(np.linalg.norm(points - center, axis=1), 90)
+    scale = NORMALIZED_RADIUS / max(float(spread), 1e-12)
+    near, far = 0.8 * scale * np.percentile(distances, 1), 1.25 * scale * np.percentile(distances, 99)
     return FieldFrame(Sim3(scale, np.eye(3), -scale * center), float(near), float(far), background)
+
+
+def frame_around(
+    center: Float[np.ndarray, "3"], radius: float, distances: Float[np.ndarray, "v"], background: Float[np.ndarray, "3"]
+) -> FieldFrame:
+    """The frame in which a cube of half side `radius` around a centre has the half side `NORMALIZED_RADIUS`.
+
+    Args:
+        distances: Of the cameras from the centre.
+    """
+    scale = NORMALIZED_RADIUS / radius
+    reach = np.sqrt(3.0) * NORMALIZED_RADIUS
+    near = max(scale * float(np.min(distances)) - reach, 0.05)
+    return FieldFrame(
+        Sim3(scale, np.eye(3), -scale * center), near, scale * float(np.max(distances)) + reach, background
+    )
 
 
 def default_background(images: tuple[PosedImage, ...]) -> Float[np.ndarray, "3"]:

@@ -19,7 +19,15 @@ import numpy as np
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
-from fieldstone.field.fast_plan import STAGE_SHARES, FastPlan, corrected, finest_for, plan_for_budget, plan_from_json
+from fieldstone.field.fast_plan import (
+    STAGE_SHARES,
+    FastPlan,
+    corrected,
+    finest_for,
+    first_plan,
+    plan_for_budget,
+    plan_from_json,
+)  # fmt: skip
 from fieldstone.field.fast_training import FastState, FastTraining, fast_training
 from fieldstone.field.radiance_field import FieldFrame, in_world
 from fieldstone.field.ray_dataset import PosedImage, RayDataset
@@ -29,7 +37,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
-from fieldstone.pipeline.field_input import read_ray_dataset
+from fieldstone.pipeline.field_input import dataset_of, open_field_input, read_images
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
     CURVE,
@@ -97,14 +105,15 @@ def train_fast_run(
         compile_kernels(executor)
         started = time.perf_counter()
         on_stage("reading photos")
-        dataset = read_ray_dataset(source, photos, MAX_SIZE_PX)
+        given_photos = open_field_input(source, photos)
+        dataset = dataset_of(given_photos, MAX_SIZE_PX, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         training = _open(dataset, given, budget_s, use_alpha, seed, executor)
         resumed = (out / CHECKPOINT).exists()
         if given is None and not resumed:
             spent = time.perf_counter() - started
             seconds_per_step = measured_step(training)
-            found = plan_for_budget(TIME_KEPT * budget_s, spent, seconds_per_step, training.plan.finest)
+            found = plan_for_budget(training.plan, TIME_KEPT * budget_s, spent, seconds_per_step)
             training = replace(training, plan=found)
         state, curve = resume_or_start(training, out, header)
         views = scene_tensors(dataset.train)
@@ -121,6 +130,7 @@ def train_fast_run(
         )
         elapsed = time.perf_counter() - started
         on_stage("rendering held-out views")
+        dataset = replace(dataset, test=read_images(given_photos.test, MAX_SIZE_PX))
         metrics = evaluate_views(in_world(training.renderer(state), dataset.frame), dataset, out / "renders" / "test")
     metrics |= {
         "seconds": elapsed,
@@ -152,24 +162,28 @@ def train_stages(
 
     Args:
         deadline: At the start of each stage, the steps to come are set to what fits until this time of
-            `time.perf_counter`; None: the plan stands.
+            `time.perf_counter`, and there training ends; None: the plan stands.
     """
     while state.step < min(state.plan.total_steps, max_steps or state.plan.total_steps):
         plan = state.plan
         stage = plan.stage_of(state.step)
         end = sum(plan.steps[: stage + 1])
-        last = min(end, max_steps or end)
+        last = min(end, plan.total_steps, max_steps or end)
         before, began = state.step, time.perf_counter()
+        left = None if deadline is None else deadline - began + (curve[-1].seconds if curve else 0.0)
 
         def save_unless_going_on(state: FastState, curve: tuple[CurvePoint, ...], last: int = last) -> None:
             if state.step != last:
                 save(state, curve)
 
         state, curve = train(
-            training, state, budget_s=None, max_steps=last, curve=curve, on_step=on_step, save=save_unless_going_on
+            training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=save_unless_going_on
         )
         now = time.perf_counter()
-        if deadline is not None and stage + 1 < len(plan.steps) and last == end:
+        if state.step < last:
+            state = replace(state, plan=replace(state.plan, stop_after=state.step))
+            logger.warning("the time is over after %d of %d steps", state.step, sum(plan.steps))
+        elif deadline is not None and stage + 1 < len(plan.steps) and last == end:
             slower = 1.4 if plan.levels(stage + 1) != plan.levels(stage) else 1.0
             per_step = slower * (now - began) / (state.step - before)
             state = replace(state, plan=corrected(plan, stage + 1, deadline - now, per_step))
@@ -217,7 +231,7 @@ def _open(
     dataset: RayDataset, given: FastPlan | None, budget_s: float, use_alpha: bool, seed: int, executor: Executor
 ) -> FastTraining:
     """The training of a dataset, with the given plan or a provisional one."""
-    provisional = given or FastPlan(finest=64, steps=(1000,) * len(STAGE_SHARES))
+    provisional = given or first_plan(64, budget_s, bounded=True)
     training = fast_training(
         dataset.train,
         dataset.frame,
@@ -226,6 +240,7 @@ def _open(
         executor=executor,
         use_alpha=use_alpha,
         points_in_world=dataset.points_in_world,
+        bounded=dataset.bounded,
     )
     if given is not None:
         return training
@@ -239,7 +254,9 @@ def _open(
     finest = finest_for(budget_s, extent, pixel_size)
     if training.unbounded:
         finest = min(2 * finest, MAX_UNBOUNDED)
-    return replace(training, plan=replace(provisional, finest=finest))
+    return replace(
+        training, plan=first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
+    )
 
 
 MAX_UNBOUNDED = 256

@@ -5,23 +5,34 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from fieldstone.errors import InputError
+from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import (
     PosedImage,
     RayDataset,
     blender_frame,
     default_background,
+    frame_around,
     frame_from_points,
+    frame_from_seen,
     reduce_images,
     split_every,
 )
-from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender, read_split
+from fieldstone.geometry.camera import image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender
 from fieldstone.io.colmap import find_colmap_model, read_colmap
+from fieldstone.io.llff import is_llff_folder, read_llff
 from fieldstone.io.photos import Photo, read_photo
+from fieldstone.io.posed_photos import PosedPhoto, PosedScene
+from fieldstone.io.transforms_json import find_transforms, read_transforms
+from fieldstone.render.camera_paths import focus_point
 from fieldstone.scene.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -29,41 +40,112 @@ logger = logging.getLogger(__name__)
 MIN_SIDE_PX = 11
 """SSIM has a window of this size."""
 
+MIN_POINTS = 10
+"""Fewer points say nothing about the range of a scene."""
 
-def read_ray_dataset(source: Path, photos: Path | None, image_size_px: int) -> RayDataset:
-    """The dataset of a Blender-format folder, or of one with a COLMAP model and its photos.
+OPEN_RADIUS, MASKED_RADIUS = 0.65, 0.6
+"""Half side of the box over the distance of the cameras from what they look at, where nothing else is known."""
 
-    Blender: photos of the train split, held out those of the test split (of the validation split without one), rays
-    from 2 to 6 on white. COLMAP: every 8th photo by name is held out; range and frame follow from the points.
+UNKNOWN = np.zeros(3)
+"""Background of a frame until the photos are read."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldInput:
+    """What a folder says, before any photo is decoded."""
+
+    train: tuple[PosedPhoto, ...]
+    test: tuple[PosedPhoto, ...]
+    points_in_world: np.ndarray
+    frame: FieldFrame | None
+    """None: depends on whether the photos have alpha, and on the cameras alone."""
+    bounded: bool
+
+
+def read_ray_dataset(source: Path, photos: Path | None, image_size_px: int, *, held_out: bool = True) -> RayDataset:
+    """The dataset of a folder with posed photos; see `open_field_input`.
 
     Args:
         photos: Folder with the photos of a COLMAP model; None: `images` beside the model, where the reconstruction
             took them from, or the folder of the model.
         image_size_px: Photos are reduced to this length of their longer side.
+        held_out: False leaves the held-out photos unread; `read_held_out` reads them.
 
     Raises:
-        InputError: Neither kind of folder, photos missing, or nothing to train on.
+        InputError: No posed photos, photos missing, or nothing to train on.
     """
-    if is_blender_folder(source):
-        dataset = _blender_dataset(source, image_size_px)
-    elif find_colmap_model(source) is not None:
-        dataset = _colmap_dataset(source, photos, image_size_px)
-    else:
-        raise InputError(
-            f"{source}: no posed photos; needs transforms_train.json (Blender format) or sparse/0 "
-            "(run `fieldstone reconstruct` on the photos first)"
-        )
-    for image in (*dataset.train, *dataset.test):
-        if min(image.pixels.shape[:2]) < MIN_SIDE_PX:
-            raise InputError(f"{image.name}: smaller than {MIN_SIDE_PX} pixels after reduction; use larger photos")
+    return dataset_of(open_field_input(source, photos), image_size_px, held_out=held_out)
+
+
+def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) -> RayDataset:
+    """Decode the photos of an input."""
+    train = read_images(given.train, image_size_px)
+    test = read_images(given.test, image_size_px) if held_out else ()
+    if not train:
+        raise InputError(f"none of {len(given.train)} photos to train on can be read, or all were held out")
+    frame, bounded = given.frame, given.bounded
+    if frame is None:
+        frame, bounded = _frame_from_cameras(train)
+    if frame.background is UNKNOWN:
+        frame = replace(frame, background=default_background(train))
     logger.info(
         "%d photos to train on, %d held out, rays from %.3g to %.3g",
-        len(dataset.train),
-        len(dataset.test),
-        dataset.frame.near,
-        dataset.frame.far,
+        len(train),
+        len(given.test),
+        frame.near,
+        frame.far,
     )
-    return dataset
+    return RayDataset(train, test, frame, given.points_in_world, bounded)
+
+
+def open_field_input(source: Path, photos: Path | None = None) -> FieldInput:
+    """Which photos with which cameras a source holds, and how far the scene reaches.
+
+    Blender folder: photos of the train split, held out those of the test split (of the validation split without one),
+    rays from 2 to 6 on white. COLMAP model, LLFF, `transforms.json`: every 8th photo by name is held out, unless the
+    file has a split of its own; the range follows from points, from a stated box, or from the cameras.
+
+    Raises:
+        InputError: No posed photos, or a damaged file.
+    """
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder")
+    if source.is_dir() and is_blender_folder(source):
+        return _blender_input(source)
+    if source.is_dir() and find_colmap_model(source) is not None:
+        return _colmap_input(source, photos)
+    if source.is_dir() and is_llff_folder(source):
+        return _input_of(read_llff(source, photos))
+    if (path := find_transforms(source)) is not None:
+        return _input_of(read_transforms(path))
+    raise InputError(
+        f"{source}: no posed photos; needs transforms_train.json (Blender format), transforms.json (nerfstudio, "
+        "instant-ngp), poses_bounds.npy (LLFF) or sparse/0 (run `fieldstone reconstruct` on the photos first)"
+    )
+
+
+def read_images(photos: Sequence[PosedPhoto], image_size_px: int) -> tuple[PosedImage, ...]:
+    """Decoded and reduced photos; those that cannot be read are left out with a warning.
+
+    Raises:
+        InputError: A photo is too small, or does not have the size of its camera.
+    """
+    images = []
+    with ThreadPoolExecutor() as pool:
+        # Decoding leaves Python's lock; results are taken in order.
+        reading = [pool.submit(read_photo, photo.path) for photo in photos]
+        for photo, found in zip(photos, reading, strict=True):
+            try:
+                pixels = pixels_of(found.result())
+            except InputError as error:
+                logger.warning("skipped %s", error)
+                continue
+            images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels))
+    reduced = reduce_images(tuple(images), image_size_px)
+    for image in reduced:
+        if min(image.pixels.shape[:2]) < MIN_SIDE_PX:
+            raise InputError(f"{image.name}: smaller than {MIN_SIDE_PX} pixels after reduction; use larger photos")
+    return reduced
 
 
 def view_labels(names: Sequence[str]) -> list[str]:
@@ -75,43 +157,84 @@ def view_labels(names: Sequence[str]) -> list[str]:
     return [stem if stems.count(stem) == 1 else str(path) for stem, path in zip(stems, paths, strict=True)]
 
 
-def _blender_dataset(folder: Path, image_size_px: int) -> RayDataset:
+def _blender_input(folder: Path) -> FieldInput:
     scene = read_blender(folder)
     held_out = next((split for split in ("test", "val") if scene.splits.get(split)), None)
-    train = reduce_images(_blender_images(scene, "train"), image_size_px)
-    test = reduce_images(_blender_images(scene, held_out), image_size_px) if held_out else ()
-    return RayDataset(train, test, blender_frame(scene.near, scene.far), np.empty((0, 3)))
+    test = _blender_photos(scene, held_out) if held_out else ()
+    frame = blender_frame(scene.near, scene.far)
+    return FieldInput(_blender_photos(scene, "train"), test, np.empty((0, 3)), frame, bounded=True)
 
 
-def _blender_images(scene: BlenderScene, split: str) -> tuple[PosedImage, ...]:
-    photos, _ = read_split(scene, split)
-    return tuple(
-        PosedImage(frame.name, scene.camera, frame.cam_from_world, pixels_of(photo)) for frame, photo in photos
-    )
+def _blender_photos(scene: BlenderScene, split: str) -> tuple[PosedPhoto, ...]:
+    return tuple(PosedPhoto(f.name, f.path, scene.camera, f.cam_from_world) for f in scene.splits[split])
 
 
-def _colmap_dataset(source: Path, photos: Path | None, image_size_px: int) -> RayDataset:
+def _input_of(scene: PosedScene) -> FieldInput:
+    train, test = scene.train, scene.test
+    if test is None:
+        kept, held_out = split_every([photo.name for photo in train])
+        train, test = tuple(train[i] for i in kept), tuple(train[i] for i in held_out)
+    centers = _centers(train)
+    if scene.box is not None:
+        middle, radius = scene.box.mean(axis=0), 0.5 * float(np.ptp(scene.box, axis=0).max())
+        distances = np.linalg.norm(centers - middle, axis=1)
+        frame = frame_around(middle, radius, distances, UNKNOWN)
+        return FieldInput(train, test, scene.points_in_world, frame, bounded=True)
+    distances = _distances_seen(train, scene.points_in_world)
+    if len(distances) < MIN_POINTS:
+        return FieldInput(train, test, np.empty((0, 3)), None, bounded=True)
+    frame = frame_from_seen(scene.points_in_world, distances, UNKNOWN)
+    return FieldInput(train, test, scene.points_in_world, frame, bounded=False)
+
+
+def _centers(photos: Sequence[PosedPhoto]) -> np.ndarray:
+    return np.array([photo.cam_from_world.target_origin_in_source() for photo in photos]).reshape(-1, 3)
+
+
+def _distances_seen(photos: Sequence[PosedPhoto], points: np.ndarray) -> np.ndarray:
+    """Distances of the points that lie in each photo, of all photos."""
+    parts = [np.empty(0)]
+    for photo in photos:
+        in_cam = photo.cam_from_world.apply(points)
+        pixels = image_from_cam(photo.camera, in_cam)
+        size = np.array([photo.camera.width, photo.camera.height])
+        inside = np.all((pixels >= -0.5) & (pixels <= size + 0.5), axis=1)
+        parts.append(np.linalg.norm(in_cam[inside], axis=1))
+    return np.concatenate(parts)
+
+
+def _frame_from_cameras(images: tuple[PosedImage, ...]) -> tuple[FieldFrame, bool]:
+    """The frame around what the cameras look at, and whether that is all there is: photos with alpha show an object."""
+    poses = Rigid3.stack([image.cam_from_world for image in images])
+    middle = focus_point(poses)
+    distances = np.linalg.norm(poses.target_origin_in_source() - middle, axis=1)
+    bounded = all(image.pixels.shape[2] == 4 for image in images)
+    radius = (MASKED_RADIUS if bounded else OPEN_RADIUS) * float(np.median(distances))
+    if not radius > 0:
+        raise InputError("all cameras stand at one place: nothing says how far the scene is; give points or a box")
+    frame = frame_around(middle, radius, distances, UNKNOWN)
+    return (frame if bounded else replace(frame, near=0.1 * frame.far)), bounded
+
+
+def _colmap_input(source: Path, photos: Path | None) -> FieldInput:
     model = read_colmap(source)
     folder = photos or _photo_folder(source, model)
-    images = []
+    found = []
     for i in model.registered().tolist():
         view = model.views[i]
-        try:
-            images.append(
-                PosedImage(view.name, model.camera_of(i), model.pose_of(i), pixels_of(read_photo(folder / view.name)))
-            )
-        except InputError as error:
-            logger.warning("skipped %s", error)
-    if not images:
+        if (folder / view.name).is_file():
+            found.append(PosedPhoto(view.name, folder / view.name, model.camera_of(i), model.pose_of(i)))
+        else:
+            logger.warning("skipped %s: no such file", folder / view.name)
+    if not found:
         raise InputError(f"{folder}: holds none of the {len(model.registered())} photos of the model; give --photos")
-    reduced = reduce_images(tuple(images), image_size_px)
-    train, test = split_every([image.name for image in images])
-    background = default_background(tuple(reduced[i] for i in train))
-    return RayDataset(
-        tuple(reduced[i] for i in train),
-        tuple(reduced[i] for i in test),
-        frame_from_points(model, background),
+    train, test = split_every([photo.name for photo in found])
+    return FieldInput(
+        tuple(found[i] for i in train),
+        tuple(found[i] for i in test),
         model.points.xyz,
+        frame_from_points(model, UNKNOWN),
+        bounded=False,
     )
 
 

@@ -1,0 +1,117 @@
+"""From scene files to what a field learns from: frames, splits, and the range of the rays."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fast_scenes import ball_images
+from fieldstone.errors import InputError
+from fieldstone.field.ray_dataset import NORMALIZED_RADIUS
+from fieldstone.io.photos import write_photo
+from fieldstone.io.ply import write_points
+from fieldstone.pipeline.field_input import open_field_input, read_ray_dataset
+from fieldstone.render.camera_paths import look_at
+from fieldstone.scene.reconstruction import Points
+
+
+def write_transforms(folder, *, alpha, **top):
+    """The ball, radius 0.8 at the origin, photographed from around."""
+    frames = []
+    images = ball_images(9)
+    for image in images:
+        write_photo(folder / f"{image.name}.png", image.pixels if alpha else image.pixels[..., :3])
+        matrix = image.cam_from_world.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{image.name}.png", "transform_matrix": matrix.tolist()})
+    camera = images[0].camera
+    content = {"fl_x": camera.focal[0], "w": camera.width, "h": camera.height, **top, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_every_eighth_photo_of_a_file_without_split_is_held_out(tmp_path, as_file):
+    folder = write_transforms(tmp_path, alpha=True)
+    dataset = read_ray_dataset(folder / "transforms.json" if as_file else folder, None, 100)
+    assert [image.name for image in dataset.test] == ["r_0.png", "r_8.png"]
+    assert [image.name for image in dataset.train] == [f"r_{k}.png" for k in range(1, 8)]
+    assert read_ray_dataset(folder, None, 100, held_out=False).test == ()
+
+
+def test_photos_with_alpha_show_an_object_in_a_box(tmp_path):
+    dataset = read_ray_dataset(write_transforms(tmp_path, alpha=True), None, 100)
+    assert dataset.bounded
+    np.testing.assert_array_equal(dataset.frame.background, 1.0)
+    world = dataset.frame.normalized_from_world
+    # The axes of the cameras meet in the middle of the ball, and the ball fits into the box.
+    np.testing.assert_allclose(world.apply(np.zeros((1, 3))), 0, atol=0.02)
+    assert 0.8 * world.scale < NORMALIZED_RADIUS
+
+
+def test_photos_without_alpha_show_a_scene_without_bounds(tmp_path):
+    dataset = read_ray_dataset(write_transforms(tmp_path, alpha=False), None, 100)
+    assert not dataset.bounded
+    mean = np.mean([image.pixels.reshape(-1, 3).mean(axis=0) for image in dataset.train], axis=0) / 255
+    np.testing.assert_allclose(dataset.frame.background, mean)
+    # The ball is inside of the box, and the cameras are outside.
+    assert 0.8 * dataset.frame.normalized_from_world.scale < NORMALIZED_RADIUS
+    assert 3.2 * dataset.frame.normalized_from_world.scale > NORMALIZED_RADIUS
+
+
+def test_a_stated_box_is_the_box(tmp_path):
+    folder = write_transforms(tmp_path, alpha=False, aabb_scale=1, scale=0.25, offset=[0.5, 0.5, 0.0])
+    dataset = read_ray_dataset(folder, None, 100)
+    assert dataset.bounded
+    # The unit cube of the file is [-2, 2] x [-2, 2] x [0, 4] in the world.
+    corners = dataset.frame.normalized_from_world.apply(np.array([[-2.0, -2, 0], [2, 2, 4]]))
+    np.testing.assert_allclose(corners, [[-NORMALIZED_RADIUS] * 3, [NORMALIZED_RADIUS] * 3])
+    assert dataset.frame.far > 0
+
+
+def test_points_of_a_file_give_the_range(tmp_path):
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
+    folder = write_transforms(tmp_path, alpha=False, ply_file_path="points.ply")
+    write_points(Points(points, np.zeros((300, 3), dtype=np.uint8)), folder / "points.ply")
+    given = open_field_input(folder)
+    assert not given.bounded
+    assert given.frame is not None
+    scale = given.frame.normalized_from_world.scale
+    assert scale == pytest.approx(NORMALIZED_RADIUS / 0.8, rel=0.1)
+    # Cameras stand 3.2 to 3.6 away from the middle.
+    assert (3.2 - 0.8) * 0.75 < given.frame.near / scale < 3.2 - 0.8
+    assert 3.2 + 0.5 < given.frame.far / scale < (3.6 + 0.8) * 1.3
+
+
+def test_llff_scenes_look_ahead(tmp_path):
+    rows = []
+    for k in range(10):
+        pose = look_at(np.array([0.1 * k, 0.05 * k, 0.0]), np.array([0.4, 0.2, 5]), np.array([0.0, -1, 0]))
+        R, t = pose.inverse().R, pose.inverse().t
+        matrix = np.column_stack([R[:, 1], R[:, 0], -R[:, 2], t, [30.0, 40.0, 35.0]])
+        rows.append(np.concatenate([matrix.reshape(-1), [2.0, 10.0]]))
+        write_photo(tmp_path / "images" / f"p{k}.png", np.full((30, 40, 3), 20 * k, dtype=np.uint8))
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
+    dataset = read_ray_dataset(tmp_path, None, 100)
+    assert [image.name for image in dataset.test] == ["p0.png", "p8.png"]
+    assert not dataset.bounded
+    scale = dataset.frame.normalized_from_world.scale
+    assert dataset.frame.near / scale == pytest.approx(0.8 * 2.0, rel=0.2)
+    assert dataset.frame.far / scale > 10.0
+
+
+def test_other_folders_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        open_field_input(tmp_path)
+    with pytest.raises(InputError, match="no such"):
+        open_field_input(tmp_path / "nowhere")
+
+
+def test_a_photo_that_cannot_be_read_is_left_out(tmp_path, caplog):
+    folder = write_transforms(tmp_path, alpha=True)
+    data = (folder / "r_3.png").read_bytes()
+    (folder / "r_3.png").write_bytes(data[: len(data) // 2])
+    names = [image.name for image in read_ray_dataset(folder, None, 100).train]
+    assert "r_3.png" not in names
+    assert len(names) == 6
+    assert "r_3.png" in caplog.text
