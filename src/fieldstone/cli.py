@@ -34,7 +34,7 @@ def reconstruct(
     /,
     out: Out,
     *,
-    mapper: Literal["auto", "textbook", "incremental"] = "auto",
+    mapper: Literal["auto", "textbook", "incremental", "global"] = "auto",
     camera_model: str | None = None,
     intrinsics: str | None = None,
     fix_intrinsics: bool = False,
@@ -51,7 +51,8 @@ def reconstruct(
     Args:
         source: Folder with photos, or in the course format (calibration.txt, matching*.txt and the photos).
         out: Folder for the result: sparse/0 (COLMAP), points.ply, run.json, report.html.
-        mapper: auto takes the textbook's stages for given matches, the incremental mapper for photos.
+        mapper: auto takes the textbook's stages for given matches, the incremental mapper for photos; global places
+            all photos at once, which is faster for large sets.
         camera_model: Model of --intrinsics, such as SIMPLE_RADIAL or OPENCV.
         intrinsics: Its parameters in pixels of the stored photo, as fx,fy,cx,cy.
         fix_intrinsics: They are exact: do not refine them.

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.calibration import CalibrationStep, as_model
+from fieldstone.mapping.global_mapper import map_global
 from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
 from fieldstone.mapping.point_update import drop_outliers
 from fieldstone.mapping.record import Drop, MappingRun, StageRecord
@@ -30,6 +32,9 @@ STARTING_STEP = CalibrationStep("SIMPLE_RADIAL", ("f", "k"))
 @dataclass(frozen=True)
 class AutomaticOptions:
     """Growing, self-calibration and the last adjustment."""
+
+    mapper: Literal["incremental", "global"] = "incremental"
+    """Photo by photo, or all at once."""
 
     incremental: IncrementalOptions = field(default_factory=IncrementalOptions)
     self_calibration: SelfCalibrationOptions = field(default_factory=SelfCalibrationOptions)
@@ -68,7 +73,8 @@ def map_automatic(
     """
     calibration = [None if known[c] else STARTING_STEP for c in range(len(cameras))]
     start_cameras = [camera if known[c] else as_model(camera, STARTING_STEP.model) for c, camera in enumerate(cameras)]
-    grown = map_incremental(graph, start_cameras, camera_of_image, calibration, options.incremental, seed)
+    mapper = map_global if options.mapper == "global" else map_incremental
+    grown = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed)
     if not grown:
         verdicts = {name: f"not registered: {verdict_of_pairs(graph, v)}" for v, name in enumerate(graph.names)}
         nothing = WorkingModel.start(tuple(cameras), camera_of_image, Observations.empty())
@@ -77,7 +83,7 @@ def map_automatic(
     best = finished[0]
     records: list[StageRecord] = record_views(best.before, graph.names, "before BA")
     records += record_views(best.model, graph.names, "after BA")
-    start = grown[0].start.pair
+    start = grown[0].initial_pair
     initial = four_poses(graph, start, start_cameras, camera_of_image)
     return MappingRun(
         to_reconstruction(best.model, graph),

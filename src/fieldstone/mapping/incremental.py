@@ -17,7 +17,7 @@ from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_arou
 from fieldstone.mapping.registration import Start, rank_starts, register_view
 from fieldstone.mapping.view_selection import next_views
 from fieldstone.mapping.working_model import WorkingModel
-from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.ransac import RansacOptions
 
@@ -66,7 +66,8 @@ class GrownModel:
     """One component, the rung of the ladder that each photo needed, and the calibration it ended with."""
 
     model: WorkingModel
-    start: Start
+    initial_pair: ImagePair
+    """The pair that it started from."""
     reasons: dict[int, str]
     """Per registered photo, the numbers of its registration."""
     failures: dict[int, str]
@@ -124,7 +125,8 @@ def _grow_one(
         model = start_model(empty, start, stage, options)
         if model is None:
             continue
-        grown = grow(model, start, free, calibration, options, seed)
+        reasons = dict.fromkeys(start.pair, f"start of the model: {start.num_points} points")
+        grown = grow(model, start.pair, reasons, free, calibration, options, seed)
         if grown.model.registered_mask().sum() > 2 or free.sum() == 2:
             return grown
         fallback = fallback or grown
@@ -146,7 +148,8 @@ def start_model(empty: WorkingModel, start: Start, stage: Stage, options: Increm
 
 def grow(
     model: WorkingModel,
-    start: Start,
+    initial_pair: ImagePair,
+    reasons: dict[int, str],
     free: Bool[np.ndarray, "n"],
     calibration: tuple[CalibrationStep | None, ...],
     options: IncrementalOptions,
@@ -156,11 +159,14 @@ def grow(
 
     Every registration is followed by a bundle adjustment: of everything while the model is small or has grown by a
     share, of the photo and its neighbours otherwise.
+
+    Args:
+        reasons: For the photos that are registered already.
     """
-    reasons = dict.fromkeys(start.pair, f"start of the model: {start.num_points} points")
+    reasons = dict(reasons)
     failures: dict[int, str] = {}
     blocked = frozenset(np.flatnonzero(~free).tolist())
-    last_global = 2
+    last_global = int(model.registered_mask().sum())
     for rung, stage in enumerate(LADDER):
         tried: frozenset[int] = frozenset()
         while candidates := next_views(model, tried | blocked, stage.min_inliers):
@@ -197,7 +203,7 @@ def grow(
             break
         refined = refine_until_stable(model, options.refinement, calibration, options.max_error_px, stage.min_angle_deg)
         model = model if collapsed(model, refined) else refined
-    return GrownModel(model, start, reasons, failures, calibration)
+    return GrownModel(model, initial_pair, reasons, failures, calibration)
 
 
 def collapsed(before: WorkingModel, after: WorkingModel) -> bool:

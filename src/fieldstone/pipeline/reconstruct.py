@@ -30,7 +30,7 @@ from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
 from fieldstone.scene.reconstruction import Reconstruction
 
-Mapper = Literal["auto", "textbook", "incremental"]
+Mapper = Literal["auto", "textbook", "incremental", "global"]
 UNITS = "units"
 """Folder below `work/` for what is kept."""
 
@@ -48,7 +48,7 @@ class ReconstructOptions:
     """How a folder becomes a model."""
 
     mapper: Mapper = "auto"
-    """auto: textbook for given matches, incremental for photos."""
+    """auto: textbook for given matches, incremental for photos; global places all photos at once."""
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     """Features, matches and two-view geometry of photos."""
     textbook: TextbookOptions = field(default_factory=TextbookOptions)
@@ -130,12 +130,12 @@ def _components_of_earlier_run(out: Path) -> int:
 
 
 def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) -> MappingRun:
-    """One of the two mappers on the same material."""
+    """One of the mappers on the same material."""
     graph, cameras, camera_of_image = material.graph, material.cameras, material.camera_of_image
     if mapper == "textbook":
         textbook = replace(options.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
-    automatic = options.incremental.with_threads(options.matching.threads)
+    automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
     return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed)
 
 
