@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from fieldstone.cli import _seconds, main
+from fieldstone.cli import main
 from fieldstone.errors import InputError
+from fieldstone.field_verbs import seconds
 from fieldstone.io.photos import write_photo
 
 
@@ -58,12 +59,12 @@ def test_mistakes_end_in_one_line(blender_folder, tmp_path, capsys, arguments, m
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("300s", 300), ("10m", 600), ("1.5h", 5400), ("42", 42)])
-def test_budgets(text, seconds):
-    assert _seconds(text) == seconds
+@pytest.mark.parametrize(("text", "expected"), [("300s", 300), ("10m", 600), ("1.5h", 5400), ("42", 42)])
+def test_budgets(text, expected):
+    assert seconds(text) == expected
 
 
 @pytest.mark.parametrize("text", ["", "s", "-3s", "0", "nan", "infs", "3d"])
 def test_bad_budgets(text):
     with pytest.raises(InputError, match="--budget"):
-        _seconds(text)
+        seconds(text)

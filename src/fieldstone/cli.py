@@ -10,23 +10,20 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
+from fieldstone.field_verbs import Out, Source, mesh, plain_console, render, seconds, train
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fieldstone.field.training import CurvePoint
     from fieldstone.pipeline.matching_options import MatchingOptions
 
 # Heavy imports live in the verbs, so that help and usage errors come at once.
-
-Source = Annotated[Path, tyro.conf.Positional]
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 
 def reconstruct(
@@ -74,7 +71,7 @@ def reconstruct(
     calibration = SelfCalibrationOptions(principal_point=not fix_principal_point)
     incremental = AutomaticOptions(self_calibration=calibration)
     options = ReconstructOptions(mapper, matching, incremental=incremental, seed=seed, fresh=fresh)
-    console = _console()
+    console = plain_console()
     with console.status("reading") as status:
         record = run(source, out, options, on_stage=status.update)
     _show_run(console, record, out)
@@ -113,142 +110,6 @@ def _matching_options(
     )
 
 
-def train(
-    source: Source,
-    /,
-    out: Out,
-    *,
-    field: Literal["fast", "tiny", "nerf"] = "fast",
-    budget: str = "60s",
-    steps: int | None = None,
-    plan: Path | None = None,
-    alpha: bool = True,
-    photos: Path | None = None,
-    device: str = "cpu",
-    threads: int = 0,
-    seed: int = 0,
-) -> int:
-    """A radiance field from posed photos, and its held-out views measured. Run it again to go on after a stop.
-
-    Args:
-        source: Folder that `reconstruct` wrote, COLMAP model with its images, Blender or LLFF folder, or
-            transforms.json of nerfstudio or instant-ngp.
-        out: Folder for the result: checkpoint.safetensors, metrics.json, curve.json, renders/test.
-        field: fast needs seconds to minutes and no torch; tiny is the small network of the course at 100x100, nerf the
-            original NeRF at 400x400.
-        budget: Time for reading and training in all, what earlier runs in this folder took included: 60s, 10m, 2h.
-        steps: Stop after so many steps in all, if the budget lasts.
-        plan: The plan.json that an earlier run of the fast field left: the same plan gives the same bytes.
-        alpha: Use the transparency of photos; --no-alpha takes them as they look on the background (fast only).
-        photos: Folder with the photos of a reconstruction, if they are not where they were.
-        device: cpu, cuda, mps (tiny and nerf).
-        threads: 0 takes all cores. The result is the same for any number.
-        seed: Every random number of the run follows from it.
-    """
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from fieldstone.pipeline.fast_fields import train_fast_run
-    from fieldstone.pipeline.fields import train_run
-
-    if field != "fast" and (plan is not None or not alpha):
-        raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
-    if field == "fast" and device != "cpu":
-        raise InputError(f"the fast field runs on the CPU, not on {device}; leave --device out")
-    budget_s = _seconds(budget)
-    console = _console()
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]}"))
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("reading", total=budget_s, found="")
-
-        def show(point: CurvePoint) -> None:
-            found = f"step {point.step}, training PSNR {point.psnr:.2f} dB"
-            progress.update(task, completed=point.seconds, found=found)
-
-        shared: dict[str, Any] = {
-            "budget_s": budget_s,
-            "max_steps": steps,
-            "seed": seed,
-            "threads": threads or None,
-            "photos": photos,
-            "on_step": show,
-            "on_stage": lambda stage: progress.update(task, description=stage),
-        }
-        if field == "fast":
-            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, **shared)
-        else:
-            metrics = train_run(source, out, field=field, device=device, **shared)
-    done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"
-    if metrics["psnr"] is None:
-        console.print(f"{done}; no photo was held out, so nothing is measured -> {out}", markup=False)
-    else:
-        console.print(
-            f"{done}; {len(metrics['views'])} held-out views: PSNR {metrics['psnr']:.2f} dB, "
-            f"SSIM {metrics['ssim']:.3f} -> {out}",
-            markup=False,
-        )
-    return 0
-
-
-def render(
-    source: Source,
-    /,
-    *,
-    path: Literal["orbit", "spiral", "through"] = "orbit",
-    format: Literal["mp4", "gif", "png"] = "mp4",
-    frames: int = 120,
-    fps: int = 30,
-    size: int | None = None,
-    device: str = "cpu",
-    threads: int = 0,
-) -> int:
-    """A film of a trained field.
-
-    Args:
-        source: Folder that `train` wrote; the film goes to its folder renders.
-        path: orbit goes around what the photos look at, spiral loops near their middle, through goes from one to
-            the next.
-        format: mp4 and gif give one file, png a folder of images.
-        frames: Number of images.
-        fps: Images per second.
-        size: Longer side in pixels; by default as trained.
-        device: cpu, cuda, mps.
-        threads: 0 takes all cores.
-    """
-    from rich.progress import Progress
-
-    from fieldstone.pipeline.field_render import render_run
-
-    console = _console()
-    with Progress(console=console) as progress:
-        task = progress.add_task("rendering", total=frames)
-        target = render_run(
-            source,
-            path=path,
-            fmt=format,
-            frames=frames,
-            fps=fps,
-            size_px=size,
-            device=device,
-            threads=threads or None,
-            on_frame=lambda done, total: progress.update(task, completed=done),
-        )
-    console.print(f"{frames} images -> {target}", markup=False)
-    return 0
-
-
-def _seconds(text: str) -> float:
-    """A time such as 300s, 10m, 1.5h, or a plain number of seconds."""
-    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
-    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = -1.0
-    if not 0 < seconds < float("inf"):
-        raise InputError(f"--budget {text}: give a positive time such as 300s, 10m or 2h")
-    return seconds
-
-
 def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: int = 0, seed: int = 0) -> int:
     """The whole road on photos of a small house that the package makes itself, and what it misses the truth by.
 
@@ -262,13 +123,13 @@ def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: in
     from fieldstone.pipeline.matching_options import MatchingOptions
     from fieldstone.pipeline.reconstruct import ReconstructOptions
 
-    console = _console()
+    console = plain_console()
     options = ReconstructOptions(matching=MatchingOptions(threads=threads or os.cpu_count() or 1), seed=seed)
     with console.status("starting") as status:
         record, metrics = run_demo(
             out,
             options,
-            budget_s=_seconds(budget),
+            budget_s=seconds(budget),
             on_stage=status.update,
             on_step=lambda p: status.update(f"training: {p.seconds:.0f} s, step {p.step}, PSNR {p.psnr:.2f} dB"),
         )
@@ -294,11 +155,11 @@ def report(source: Source, /) -> int:
     from fieldstone.report.summary import write_report
 
     path = write_report(source)
-    _console().print(f"open {path}", markup=False)
+    plain_console().print(f"open {path}", markup=False)
     return 0
 
 
-VERBS = {"demo": demo, "reconstruct": reconstruct, "train": train, "render": render, "report": report}
+VERBS = {"demo": demo, "reconstruct": reconstruct, "train": train, "render": render, "mesh": mesh, "report": report}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -326,12 +187,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("fieldstone: interrupted; what was finished is kept\n")
         return 130
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(highlight=False)
 
 
 def _show_run(console: Console, record: dict[str, Any], out: Path) -> None:

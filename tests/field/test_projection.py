@@ -3,7 +3,13 @@ import pytest
 
 from fast_scenes import CAMERA, FRAME
 from fieldstone.field.fast_step_numba import project_ray_numba
-from fieldstone.field.projection import distance_along, project_points, project_rays, projection_for
+from fieldstone.field.projection import (
+    distance_along,
+    project_points,
+    project_rays,
+    projection_for,
+    unproject_points,
+)  # fmt: skip
 from fieldstone.field.ray_dataset import PosedImage
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
@@ -43,6 +49,13 @@ def test_points_of_a_ray_stay_on_its_projection(space):
         np.testing.assert_allclose(
             distance_along(projection, rays.origins, rays.directions, along / length), t, rtol=1e-4
         )
+
+
+def test_points_come_back_from_the_projection(space):
+    projection, _, _ = space
+    ahead = np.array([[0.1, -0.3, 2.0], [1.0, 2.0, 7.0], [-3.0, 0.5, 90.0]])
+    points = ahead @ projection.R.astype(np.float64) + projection.center
+    np.testing.assert_allclose(unproject_points(projection, project_points(projection, points)), points, rtol=1e-4)
 
 
 def test_the_box_holds_all_rays(space):

@@ -15,6 +15,7 @@ from fieldstone.errors import InputError
 from fieldstone.field.fast_decoder import HIDDEN, Decoder, decode
 from fieldstone.field.fast_decoder_numba import decode_directions, decode_numba
 from fieldstone.field.fast_grid import CHANNELS, GridLayout, grid_layout, interpolate
+from fieldstone.field.fast_grid_numba import interpolate_numba
 from fieldstone.field.fast_march_numba import (
     MAX_RAW,
     MIN_RAW,
@@ -84,7 +85,9 @@ class FastField:
         cell = np.floor(local / self.occupancy.cell_size).astype(np.int64)
         inside = np.all((local >= 0) & (local < self.layout.extent) & (cell < self.occupancy.cells.shape), axis=1)
         inside[inside] = self.occupancy.cells[tuple(cell[inside].T)]
-        raw = self.raw_offset + interpolate(self.layout, self.table, local[inside])[:, :, 0].sum(axis=1)
+        grid = self.layout.arrays(self.table)
+        values = interpolate_numba(grid, np.ascontiguousarray(local[inside], dtype=np.float32))
+        raw = self.raw_offset + values[:, ::CHANNELS].sum(axis=1)
         out = np.zeros(len(points))
         out[inside] = np.where(raw > MIN_RAW, np.exp(np.minimum(raw, MAX_RAW)), 0.0) / self.reference_length
         return out

@@ -97,6 +97,13 @@ def project_points(projection: Projection, points: Float[np.ndarray, "n 3"]) -> 
     return np.stack([x / z, y / z, projection.depth * (1.0 - projection.near / z)], axis=1)
 
 
+def unproject_points(projection: Projection, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The inverse of `project_points`, for points before infinity."""
+    z = projection.near / (1.0 - points[:, 2] / float(projection.depth))
+    local = np.stack([points[:, 0] * z, points[:, 1] * z, z], axis=1)
+    return local @ projection.R.astype(np.float64) + projection.center
+
+
 def project_rays(
     projection: Projection, origins: Float[np.ndarray, "r 3"], directions: Float[np.ndarray, "r 3"]
 ) -> tuple[Float[np.ndarray, "r 3"], Float[np.ndarray, "r 3"], Float[np.ndarray, "r"]]:

@@ -1,0 +1,169 @@
+"""A trained fast field to a coloured mesh, and how well the mesh agrees with the field."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.errors import InputError
+from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
+from fieldstone.field.projection import project_points, unproject_points
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world
+from fieldstone.geometry.camera import Camera, rescale
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.atomic import write_json
+from fieldstone.io.checkpoint import read_checkpoint
+from fieldstone.io.meshes import write_mesh
+from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
+from fieldstone.render.camera_paths import up_direction
+from fieldstone.render.meshing import cleaned, colored, solidity, surface
+from fieldstone.render.rasterize_numba import mesh_depth
+from fieldstone.render.views import render_view
+from fieldstone.scene.mesh import Mesh
+from fieldstone.scene.rays import rays_from_view
+
+logger = logging.getLogger(__name__)
+
+MAX_CELLS = 320
+"""Grid points along the longest side, unless asked for: more than the eye sees in most viewers."""
+
+LENGTH_CELLS = 2.0
+"""The light that this many cells of the finest level stop decides what is solid."""
+
+MAX_DEPTH_SHARE = 0.97
+"""In a projective space, what lies nearer to infinity has no surface."""
+
+COMPARED_VIEWS, COMPARED_SIZE_PX = 8, 200
+"""How many photos' views, at which size, the mesh is compared with its field in."""
+
+MESH = "mesh.json"
+
+
+def mesh_run(
+    out: Path,
+    *,
+    fmt: str = "ply",
+    cells: int | None = None,
+    level: float = 0.5,
+    threads: int | None = None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+) -> dict[str, Any]:
+    """Write `out`/mesh.FMT from the fast field that training left in `out`, and `out`/mesh.json about it.
+
+    Args:
+        fmt: ply, obj or glb.
+        cells: Grid cells along the longest side; None: as the field, at most `MAX_CELLS`.
+        level: Share of the light that matter must stop to count as solid.
+
+    Returns:
+        What `mesh.json` holds: sizes, floaters removed, and the agreement with the field in views of the photos.
+
+    Raises:
+        InputError: No fast field in `out`, or nothing solid in it.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"--level must lie between 0 and 1, got {level:g}")
+    if cells is not None and cells < 2:
+        raise InputError(f"--cells must be at least 2, got {cells}")
+    tensors, header = read_checkpoint(out / CHECKPOINT)
+    if header["field"] != "fast":
+        raise InputError(
+            f"{out}: a mesh needs the fast field, not the {header['field']} network; train without --field"
+        )
+    poses, state_tensors = split_tensors(tensors)
+    field, frame = field_from_tensors(state_tensors), frame_from_header(header)
+    on_stage("extracting the surface")
+    mesh, floaters = normalized_mesh(field, frame, poses, cells, level)
+    world = frame.normalized_from_world.inverse()
+    mesh = Mesh(world.apply(mesh.vertices), mesh.faces, mesh.colors)
+    path = out / f"mesh.{fmt}"
+    write_mesh(_upright(mesh, poses) if fmt == "glb" else mesh, path)
+    on_stage("comparing it with the field")
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+        render_rays = in_world(renderer(field, frame, executor), frame)
+        record = {
+            "path": path.name,
+            "vertices": len(mesh.vertices),
+            "faces": len(mesh.faces),
+            "floaters_removed": floaters,
+            "closed": mesh.is_closed(),
+            **agreement(mesh, render_rays, header, poses),
+        }
+    write_json(out / MESH, record)
+    return record
+
+
+def normalized_mesh(
+    field: FastField, frame: FieldFrame, poses: Rigid3, cells: int | None, level: float
+) -> tuple[Mesh, int]:
+    """The coloured mesh of a field in normalised coordinates, and the number of floaters removed.
+
+    Marching cubes runs in the space of the grids; vertices then leave a projective space, where there is one. Of an
+    unbounded scene, what lies beyond the box is left out.
+    """
+    open_scene = field.unbounded or field.projection.active
+    lower, upper = field.occupancy.lower, field.occupancy.lower + field.layout.extent
+    if field.unbounded:
+        lower, upper = lower + 0.25 * field.layout.extent, upper - 0.25 * field.layout.extent
+    if field.projection.active:
+        upper = np.append(upper[:2], MAX_DEPTH_SHARE * field.projection.depth)
+    finest = float(field.layout.spacings[-1])
+    spacing = max(finest, float(np.max(upper - lower)) / (cells or MAX_CELLS))
+    if cells is not None:
+        spacing = float(np.max(upper - lower)) / cells
+    share, floaters = cleaned(solidity(field.density, lower, upper, spacing, LENGTH_CELLS * finest), level)
+    mesh = surface(share, level, lower, spacing, closed=not open_scene)
+    logger.info("surface of %d faces, %d floaters removed", len(mesh.faces), floaters)
+    centers = frame.normalized_from_world.apply(poses.target_origin_in_source())
+    if not field.projection.active:
+        return colored(mesh, field.color, centers, 0.5 * finest), floaters
+
+    def color(points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        return field.color(np.clip(project_points(field.projection, points), lower, upper - 1e-6), directions)
+
+    mesh = Mesh(unproject_points(field.projection, mesh.vertices), mesh.faces)
+    return colored(mesh, color, centers, 0.0), floaters
+
+
+def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], poses: Rigid3) -> dict[str, Any]:
+    """Silhouettes (intersection over union) and depths of the mesh against those of the field, in views of photos."""
+    stored = header["cameras"]
+    overlap, union, depths = 0, 0, []
+    views = np.unique(np.linspace(0, len(poses.t) - 1, COMPARED_VIEWS).astype(np.int64)).tolist()
+    for v in views:
+        c = stored[header["camera_of_view"][v]]
+        camera = Camera(c["model"], c["width"], c["height"], np.array(c["params"]))
+        factor = min(COMPARED_SIZE_PX / max(camera.width, camera.height), 1.0)
+        camera = rescale(camera, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        seen = render_view(render_rays, camera, poses[v])
+        depth = mesh_depth(mesh, camera, poses[v])
+        solid, of_mesh = seen.opacity > 0.5, np.isfinite(depth)
+        overlap += int(np.count_nonzero(solid & of_mesh))
+        union += int(np.count_nonzero(solid | of_mesh))
+        along_z = rays_from_view(camera, poses[v]).directions @ poses[v].R[2]
+        field_depth = seen.depth * along_z.reshape(depth.shape)
+        both = of_mesh & (seen.opacity > 0.95)
+        depths.append(np.abs(depth[both] / field_depth[both] - 1.0))
+    errors = np.concatenate(depths) if depths else np.empty(0)
+    return {
+        "silhouette_iou": overlap / max(union, 1),
+        "depth_error_median_percent": 100.0 * float(np.median(errors)) if len(errors) else None,
+        "compared": f"{len(views)} views of training photos, longer side at most {COMPARED_SIZE_PX} pixels; "
+        "silhouette: opacity above 0.5; depth: where opacity is above 0.95",
+    }
+
+
+def _upright(mesh: Mesh, poses: Rigid3) -> Mesh:
+    """The mesh with y up, as glTF has it, about where photos were held level."""
+    up = up_direction(poses)
+    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    side /= np.linalg.norm(side)
+    R = np.stack([side, up, np.cross(side, up)])
+    return Mesh(mesh.vertices @ R.T, mesh.faces, mesh.colors)

@@ -1,0 +1,60 @@
+"""A trained ball to a mesh, as typed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fast_scenes import RADIUS, ball_images
+from fieldstone.cli import main
+from fieldstone.errors import InputError
+from fieldstone.io.photos import write_photo
+from fieldstone.io.ply import read_points
+from fieldstone.pipeline.fast_fields import train_fast_run
+from fieldstone.pipeline.field_mesh import mesh_run
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A field of the ball, from a transforms.json."""
+    folder = tmp_path_factory.mktemp("ball")
+    images = ball_images(24, heights=(0.3, 2.4, -2.2))
+    frames = []
+    for image in images:
+        write_photo(folder / f"{image.name}.png", image.pixels)
+        matrix = image.cam_from_world.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": image.name, "transform_matrix": matrix.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": images[0].camera.focal[0], "frames": frames}))
+    plan = {"finest": 48, "steps": [40] * 8, "num_chunks": 2, "samples_per_chunk": 1024}
+    (folder / "plan.json").write_text(json.dumps(plan))
+    train_fast_run(folder, folder / "out", plan=folder / "plan.json", threads=2)
+    return folder / "out"
+
+
+def test_the_mesh_of_a_ball(trained):
+    record = mesh_run(trained, threads=1)
+    assert record == json.loads((trained / "mesh.json").read_text())
+    points = read_points(trained / record["path"])
+    distance = np.linalg.norm(points.xyz, axis=1)
+    # Pixels are 0.07 wide at the ball; a surface learned from them is right to a fraction of one.
+    assert np.median(np.abs(distance - RADIUS)) < 0.03
+    # Colours are those of the normal.
+    seen = np.abs(distance - RADIUS) < 0.05
+    expected = 255 * (0.5 + 0.5 * points.xyz[seen] / distance[seen, None])
+    assert np.median(np.abs(points.rgb[seen] - expected)) < 20
+    assert record["closed"]
+    assert record["silhouette_iou"] > 0.93
+    assert record["depth_error_median_percent"] < 2.0
+
+
+def test_formats_as_typed(trained, capsys):
+    for suffix in ("obj", "glb"):
+        assert main(["mesh", str(trained), "--format", suffix, "--cells", "32", "--threads", "1"]) == 0
+        assert (trained / f"mesh.{suffix}").stat().st_size > 1000
+    assert "IoU" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("options", "message"), [({"level": 1.0}, "--level"), ({"cells": 1}, "--cells")])
+def test_mistakes_are_named(trained, options, message):
+    with pytest.raises(InputError, match=message):
+        mesh_run(trained, **options)
