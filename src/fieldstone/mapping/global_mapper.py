@@ -79,7 +79,7 @@ def map_global(
             continue
         model, pair = placed
         reasons = dict.fromkeys(np.flatnonzero(model.registered_mask()).tolist(), "placed with all others at once")
-        grown.append(grow(model, pair, reasons, free, tuple(calibration), options, seed))
+        grown.append(grow(model, graph, pair, reasons, free, tuple(calibration), options, seed))
         free = free & ~grown[-1].model.registered_mask()
         logger.info("component of %d photos", grown[-1].model.registered_mask().sum())
         edges = edges.where(np.all(free[edges.pairs], axis=1))

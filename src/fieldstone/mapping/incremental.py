@@ -15,6 +15,7 @@ from fieldstone.mapping.calibration import CalibrationStep
 from fieldstone.mapping.growth import retriangulate, tracks_of_view
 from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
 from fieldstone.mapping.registration import Start, rank_starts, register_view
+from fieldstone.mapping.structureless import pose_from_partners
 from fieldstone.mapping.view_selection import next_views
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
@@ -126,7 +127,7 @@ def _grow_one(
         if model is None:
             continue
         reasons = dict.fromkeys(start.pair, f"start of the model: {start.num_points} points")
-        grown = grow(model, start.pair, reasons, free, calibration, options, seed)
+        grown = grow(model, graph, start.pair, reasons, free, calibration, options, seed)
         if grown.model.registered_mask().sum() > 2 or free.sum() == 2:
             return grown
         fallback = fallback or grown
@@ -148,6 +149,7 @@ def start_model(empty: WorkingModel, start: Start, stage: Stage, options: Increm
 
 def grow(
     model: WorkingModel,
+    graph: MatchGraph,
     initial_pair: ImagePair,
     reasons: dict[int, str],
     free: Bool[np.ndarray, "n"],
@@ -158,7 +160,7 @@ def grow(
     """Register photo after photo until none of the free ones fits, relaxing the thresholds step by step.
 
     Every registration is followed by a bundle adjustment: of everything while the model is small or has grown by a
-    share, of the photo and its neighbours otherwise.
+    share, of the photo and its neighbours otherwise. What no points place is tried from relative poses in the end.
 
     Args:
         reasons: For the photos that are registered already.
@@ -169,33 +171,42 @@ def grow(
     last_global = int(model.registered_mask().sum())
     for rung, stage in enumerate(LADDER):
         tried: frozenset[int] = frozenset()
-        while candidates := next_views(model, tried | blocked, stage.min_inliers):
-            view = candidates[0]
-            rng = np.random.default_rng([seed, view, int(model.registered_mask().sum()), rung])
-            result = register_view(model, view, options.pnp, stage.min_inliers, rng)
-            if result.cam_from_world is None:
-                tried |= {view}
-                failures[view] = result.reason()
-                continue
-            previous = model
-            model = model.with_pose(view, result.cam_from_world)
-            model = retriangulate(
-                model, tracks_of_view(model, view), max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg
-            )
-            size = int(model.registered_mask().sum())
-            everything = size <= options.refinement.always_global or size >= options.refinement.growth * last_global
-            if everything:
-                model, touched = adjust(model, options.refinement, calibration), np.ones(len(model.xyz), dtype=bool)
+        without_points: list[int] | None = None
+        while True:
+            candidates = next_views(model, tried | blocked, stage.min_inliers)
+            if candidates:
+                view = candidates[0]
+                rng = np.random.default_rng([seed, view, int(model.registered_mask().sum()), rung])
+                result = register_view(model, view, options.pnp, stage.min_inliers, rng)
+                pose, reason = result.cam_from_world, result.reason()
+            elif stage is LADDER[-1]:
+                if without_points is None:
+                    without_points = np.flatnonzero(free & ~model.registered_mask()).tolist()
+                if not without_points:
+                    break
+                view = without_points.pop(0)
+                pose = pose_from_partners(model, graph, view, stage.min_inliers)
+                reason = "placed by relative poses, without points"
+                if pose is None:
+                    continue
             else:
-                model, touched = adjust_around(model, view, options.refinement)
-            model = retriangulate(model, touched, max_error_px=options.max_error_px, min_angle_deg=stage.min_angle_deg)
-            if collapsed(previous, model):
-                model, tried = previous, tried | {view}
-                failures[view] = f"{result.reason()}, but the model falls apart with it"
+                break
+            if pose is None:
+                tried |= {view}
+                failures[view] = reason
                 continue
-            logger.info("registered view %d: %s", view, result.reason())
-            reasons[view] = result.reason()
+            size = int(model.registered_mask().sum()) + 1
+            everything = size <= options.refinement.always_global or size >= options.refinement.growth * last_global
+            larger = _with_view(model, view, pose, stage, everything, calibration, options)
+            if larger is None:
+                tried |= {view}
+                failures[view] = f"{reason}, but the model falls apart with it"
+                continue
+            model = larger
+            logger.info("registered view %d: %s", view, reason)
+            reasons[view] = reason
             failures.pop(view, None)
+            without_points = None
             if everything:
                 last_global, tried = size, frozenset()  # a better model may take what a worse one could not
         everyone = model.registered_mask() | ~free
@@ -204,6 +215,28 @@ def grow(
         refined = refine_until_stable(model, options.refinement, calibration, options.max_error_px, stage.min_angle_deg)
         model = model if collapsed(model, refined) else refined
     return GrownModel(model, initial_pair, reasons, failures, calibration)
+
+
+def _with_view(
+    model: WorkingModel,
+    view: int,
+    pose: Rigid3,
+    stage: Stage,
+    everything: bool,
+    calibration: tuple[CalibrationStep | None, ...],
+    options: IncrementalOptions,
+) -> WorkingModel | None:
+    """The adjusted model with one more photo; None if that costs it its points, or the photo sees too few of them."""
+    limits = {"max_error_px": options.max_error_px, "min_angle_deg": stage.min_angle_deg}
+    larger = model.with_pose(view, pose)
+    larger = retriangulate(larger, tracks_of_view(larger, view), **limits)
+    if everything:
+        larger, touched = adjust(larger, options.refinement, calibration), np.ones(len(larger.xyz), dtype=bool)
+    else:
+        larger, touched = adjust_around(larger, view, options.refinement)
+    larger = retriangulate(larger, touched, **limits)
+    too_few = len(larger.observations_of(view)) < stage.min_inliers
+    return None if too_few or collapsed(model, larger) else larger
 
 
 def collapsed(before: WorkingModel, after: WorkingModel) -> bool:
