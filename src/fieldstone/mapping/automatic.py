@@ -18,6 +18,7 @@ from fieldstone.mapping.point_update import drop_outliers
 from fieldstone.mapping.record import Drop, MappingRun, StageRecord
 from fieldstone.mapping.refinement import adjust, refine_until_stable
 from fieldstone.mapping.registration import verdict_of_pairs
+from fieldstone.mapping.rescue import MoreMatches, rescue
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
 from fieldstone.mapping.textbook import four_poses
 from fieldstone.mapping.working_model import WorkingModel, record_views, to_reconstruction
@@ -64,12 +65,14 @@ def map_automatic(
     known: Bool[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
+    second_look: Sequence[MoreMatches] = (),
 ) -> MappingRun:
     """Models of all components; the one with most photos is the reconstruction, the others are kept beside it.
 
     Args:
         graph: Verified, see `features.verification`.
         known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
+        second_look: Ways to find more matches for photos that no model takes in, tried in turn.
     """
     calibration = [None if known[c] else STARTING_STEP for c in range(len(cameras))]
     start_cameras = [camera if known[c] else as_model(camera, STARTING_STEP.model) for c, camera in enumerate(cameras)]
@@ -79,6 +82,7 @@ def map_automatic(
         verdicts = {name: f"not registered: {verdict_of_pairs(graph, v)}" for v, name in enumerate(graph.names)}
         nothing = WorkingModel.start(tuple(cameras), camera_of_image, Observations.empty())
         return MappingRun(to_reconstruction(nothing, graph), graph, None, (), (), None, verdicts)
+    grown, graph = rescue(grown, graph, second_look, options.incremental, seed)
     finished = [finish(component, options, np.random.default_rng([seed, k])) for k, component in enumerate(grown)]
     best = finished[0]
     records: list[StageRecord] = record_views(best.before, graph.names, "before BA")

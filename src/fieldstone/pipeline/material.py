@@ -18,10 +18,12 @@ from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.matching_txt import read_course_folder
 from fieldstone.io.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.io.workspace import Workspace
+from fieldstone.mapping.rescue import MoreMatches
 from fieldstone.pipeline.detection import detect
 from fieldstone.pipeline.matched_pairs import match_pairs, verify
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_unknown
+from fieldstone.pipeline.second_look import SecondLook
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -50,6 +52,8 @@ class Material:
     seconds: Mapping[str, float]
     sizes: tuple[tuple[int, int], ...]
     """(width, height) of the photo behind each camera."""
+    second_look: tuple[MoreMatches, ...] = ()
+    """Ways to find more matches for photos that no model takes in."""
 
     def full_size(self, model: Reconstruction) -> Reconstruction:
         """A reconstruction in working pixels, in the pixels of the photos."""
@@ -123,7 +127,8 @@ def match_photos(
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
-    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes)
+    attempts = SecondLook(photos, camera_of_image, options, seed).attempts()
+    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts)
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:

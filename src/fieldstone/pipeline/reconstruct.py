@@ -136,7 +136,7 @@ def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) 
         textbook = replace(options.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
     automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
-    return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed)
+    return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look)
 
 
 def full_size(run: MappingRun, material: Material) -> MappingRun:
