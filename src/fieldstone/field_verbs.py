@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Source = Annotated[Path, tyro.conf.Positional]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
+QUALITIES = {"draft": "20s", "normal": "60s", "high": "5m"}
+
 
 def train(
     source: Source,
@@ -26,7 +28,9 @@ def train(
     out: Out,
     *,
     field: Literal["fast", "tiny", "nerf"] = "fast",
-    budget: str = "60s",
+    budget: str | None = None,
+    quality: Literal["draft", "normal", "high"] = "normal",
+    memory: float = 4.0,
     steps: int | None = None,
     plan: Path | None = None,
     alpha: bool = True,
@@ -44,6 +48,8 @@ def train(
         field: fast needs seconds to minutes and no torch; tiny is the small network of the course at 100x100, nerf the
             original NeRF at 400x400.
         budget: Time for reading and training in all, what earlier runs in this folder took included: 60s, 10m, 2h.
+        quality: The budget, where none is given: draft 20s, normal 60s, high 5m.
+        memory: GiB that grids and rays may take (fast only).
         steps: Stop after so many steps in all, if the budget lasts.
         plan: The plan.json that an earlier run of the fast field left: the same plan gives the same bytes.
         alpha: Use the transparency of photos; --no-alpha takes them as they look on the background (fast only).
@@ -61,7 +67,7 @@ def train(
         raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
     if field == "fast" and device != "cpu":
         raise InputError(f"the fast field runs on the CPU, not on {device}; leave --device out")
-    budget_s = seconds(budget)
+    budget_s = seconds(budget or QUALITIES[quality])
     console = plain_console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]}"))
     with Progress(*columns, console=console) as progress:
@@ -81,7 +87,7 @@ def train(
             "on_stage": lambda stage: progress.update(task, description=stage),
         }
         if field == "fast":
-            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, **shared)
+            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, memory_gib=memory, **shared)
         else:
             metrics = train_run(source, out, field=field, device=device, **shared)
     done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"
@@ -102,6 +108,7 @@ def render(
     *,
     path: Literal["orbit", "spiral", "through"] = "orbit",
     format: Literal["mp4", "gif", "png"] = "mp4",
+    show: Literal["color", "depth", "normals", "opacity"] = "color",
     frames: int = 120,
     fps: int = 30,
     size: int | None = None,
@@ -115,6 +122,7 @@ def render(
         path: orbit goes around what the photos look at, spiral loops near their middle, through goes from one to
             the next.
         format: mp4 and gif give one file, png a folder of images.
+        show: color; depth, near is bright; normals as colours, x to the right, y up, z to the camera; opacity.
         frames: Number of images.
         fps: Images per second.
         size: Longer side in pixels; by default as trained.
@@ -132,6 +140,7 @@ def render(
             source,
             path=path,
             fmt=format,
+            show=show,
             frames=frames,
             fps=fps,
             size_px=size,

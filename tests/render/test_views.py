@@ -5,7 +5,7 @@ from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render import views
-from fieldstone.render.views import render_view
+from fieldstone.render.views import RenderedView, depth_image, normal_image, render_view
 
 
 def render_ball(rays):
@@ -43,3 +43,23 @@ def test_pixels_outside_of_the_lens_are_empty():
     assert view.depth[0, 0] == 0
     assert view.opacity[2, 3] == 1
     assert np.all(np.isfinite(view.rgb))
+
+
+def test_normals_of_a_ball_are_those_of_its_surface():
+    camera = Camera("PINHOLE", 80, 60, np.array([90.0, 90.0, 40.0, 30.0]))
+    pose = Rigid3(rotation.exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, -0.1, 4.0]))
+    view = render_view(render_ball, camera, pose)
+    found = normal_image(view, camera) * 2 - 1
+    # The ball is coloured by its normal in the world; in the camera, OpenGL axes turn y and z around.
+    expected = (2 * view.rgb - 1) @ pose.R.T * [1, -1, -1]
+    inner = (view.opacity > 0) & (expected[:, :, 2] > 0.75)
+    # Away from the outline, where a difference over two pixels takes in the background.
+    assert np.abs(found - expected)[inner].max() < 0.03
+    assert np.all(found[view.opacity == 0] == -1)
+
+
+def test_depth_is_bright_where_it_is_near():
+    depth = np.array([[2.0, 4.0, 8.0, 3.0]])
+    view = RenderedView(np.zeros((1, 4, 3)), depth, np.array([[1.0, 1, 1, 0]]))
+    # Linear in 1 / depth from 1 at 2 to 0 at 8; nothing is seen at the last pixel.
+    np.testing.assert_allclose(depth_image(view, 2.0, 8.0)[0, :, 0], [1.0, 1 / 3, 0.0, 0.0])

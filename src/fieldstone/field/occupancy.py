@@ -101,7 +101,7 @@ def cell_distances(cells: Bool[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "x y z
 
 def visual_hull(
     box: Occupancy,
-    masks: Sequence[Bool[np.ndarray, "h w"]],
+    masks: Sequence[Bool[np.ndarray, "_ _"]],
     cameras: Sequence[Camera],
     cam_from_box: Sequence[Rigid3],
     num_cells: int,
@@ -153,7 +153,7 @@ def _pooled(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h2 w2"], i
     return np.any(padded.reshape(height, factor, width, factor), axis=(1, 3)), factor
 
 
-def _summed(masks: Sequence[Bool[np.ndarray, "h w"]]) -> Int[np.ndarray, "v h2 w2"]:
+def _summed(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> Int[np.ndarray, "v h2 w2"]:
     """Number of set pixels above and left of each corner; photos of different sizes are padded."""
     height, width = (max(mask.shape[axis] for mask in masks) for axis in (0, 1))
     sums = np.zeros((len(masks), height + 2, width + 2), dtype=np.int32)

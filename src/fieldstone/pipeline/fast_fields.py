@@ -19,6 +19,7 @@ import numpy as np
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import quantize
 from fieldstone.field.fast_plan import (
     STAGE_SHARES,
     FastPlan,
@@ -30,13 +31,14 @@ from fieldstone.field.fast_plan import (
 )  # fmt: skip
 from fieldstone.field.fast_training import FastState, FastTraining, fast_training
 from fieldstone.field.radiance_field import FieldFrame, in_world
-from fieldstone.field.ray_dataset import PosedImage, RayDataset
+from fieldstone.field.ray_dataset import PosedImage, RayDataset, reduce_image
 from fieldstone.field.training import CurvePoint, OnStep, train
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
+from fieldstone.io.photos import write_photo
 from fieldstone.pipeline.field_input import dataset_of, open_field_input, read_images
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
@@ -49,10 +51,14 @@ from fieldstone.pipeline.fields import (
     scene_tensors,
     write_field_report,
 )
+from fieldstone.render.views import render_view
 
 logger = logging.getLogger(__name__)
 
-PLAN = "plan.json"
+PLAN, PREVIEW = "plan.json", "preview.png"
+
+PREVIEW_SIZE_PX = 200
+"""The first training view is shown at this size after every stage."""
 
 MAX_SIZE_PX = 4096
 """Photos are reduced to this length of their longer side."""
@@ -72,6 +78,7 @@ def train_fast_run(
     max_steps: int | None = None,
     plan: Path | None = None,
     use_alpha: bool = True,
+    memory_gib: float = 4.0,
     seed: int = 0,
     threads: int | None = None,
     photos: Path | None = None,
@@ -89,6 +96,7 @@ def train_fast_run(
         max_steps: Stop after so many steps of the plan.
         plan: The plan.json of another run, to be followed to the letter; the budget is then ignored.
         use_alpha: False takes photos with alpha as photos on the background.
+        memory_gib: What grids and rays may take; the finest grid is chosen to fit.
 
     Returns:
         What `metrics.json` holds.
@@ -108,7 +116,7 @@ def train_fast_run(
         given_photos = open_field_input(source, photos)
         dataset = dataset_of(given_photos, MAX_SIZE_PX, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
-        training = _open(dataset, given, budget_s, use_alpha, seed, executor)
+        training = _open(dataset, given, budget_s, use_alpha, seed, executor, memory_gib)
         resumed = (out / CHECKPOINT).exists()
         if given is None and not resumed:
             spent = time.perf_counter() - started
@@ -123,10 +131,15 @@ def train_fast_run(
             write_text(out / PLAN, state.plan.to_json() + "\n")
             write_checkpoint(out / CHECKPOINT, {**views, **prefixed(training.to_tensors(state))}, header)
 
+        def preview(state: FastState) -> None:
+            image = reduce_image(dataset.train[0], PREVIEW_SIZE_PX)
+            view = render_view(in_world(training.renderer(state), dataset.frame), image.camera, image.cam_from_world)
+            write_photo(out / PREVIEW, quantize(view.rgb))
+
         on_stage("training")
         deadline = None if given is not None or resumed else started + TIME_KEPT * budget_s
         state, curve = train_stages(
-            training, state, curve, deadline=deadline, max_steps=max_steps, on_step=on_step, save=save
+            training, state, curve, deadline=deadline, max_steps=max_steps, on_step=on_step, save=save, preview=preview
         )
         elapsed = time.perf_counter() - started
         on_stage("rendering held-out views")
@@ -157,6 +170,7 @@ def train_stages(
     max_steps: int | None,
     on_step: OnStep,
     save: Callable[[FastState, tuple[CurvePoint, ...]], None],
+    preview: Callable[[FastState], None] = lambda state: None,
 ) -> tuple[FastState, tuple[CurvePoint, ...]]:
     """Follow the plan of a state to its end, stage by stage.
 
@@ -179,6 +193,7 @@ def train_stages(
         state, curve = train(
             training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=save_unless_going_on
         )
+        preview(state)
         now = time.perf_counter()
         if state.step < last:
             state = replace(state, plan=replace(state.plan, stop_after=state.step))
@@ -228,7 +243,13 @@ def training_view(image: PosedImage) -> Any:
 
 
 def _open(
-    dataset: RayDataset, given: FastPlan | None, budget_s: float, use_alpha: bool, seed: int, executor: Executor
+    dataset: RayDataset,
+    given: FastPlan | None,
+    budget_s: float,
+    use_alpha: bool,
+    seed: int,
+    executor: Executor,
+    memory_gib: float = 4.0,
 ) -> FastTraining:
     """The training of a dataset, with the given plan or a provisional one."""
     provisional = given or first_plan(64, budget_s, bounded=True)
@@ -254,10 +275,35 @@ def _open(
     finest = finest_for(budget_s, extent, pixel_size)
     if training.unbounded:
         finest = min(2 * finest, MAX_UNBOUNDED)
+    finest = min(finest, _finest_in_memory(training, memory_gib))
     return replace(
         training, plan=first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
     )
 
+
+def _finest_in_memory(training: FastTraining, memory_gib: float) -> int:
+    """Cells along the longest side whose grids fit beside the rays.
+
+    A vertex of the finest level has 32 bytes of values and velocities, all coarser levels add a seventh and their
+    gradients; growing by a level needs the old values once more.
+
+    Raises:
+        InputError: Not even the coarsest grids fit.
+    """
+    rays = training.rays
+    used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings))
+    left = memory_gib * 2**30 - used
+    extent = training.occupancy.extent / np.max(training.occupancy.extent)
+    finest = int(np.cbrt(max(left, 0.0) / (BYTES_PER_VERTEX * np.prod(extent))))
+    if finest < MIN_FINEST:
+        raise InputError(
+            f"--memory {memory_gib:g}: the rays of the photos take {used / 2**30:.2f} GiB and leave no room for grids; "
+            "give more memory or smaller photos"
+        )
+    return finest
+
+
+BYTES_PER_VERTEX, MIN_FINEST = 48, 16
 
 MAX_UNBOUNDED = 256
 """As `fast_plan.MAX_FINEST`, for a box of which nearly all cells may be used."""

@@ -206,11 +206,11 @@ def _distances_seen(photos: Sequence[PosedPhoto], points: np.ndarray) -> np.ndar
 def _frame_from_cameras(images: tuple[PosedImage, ...]) -> tuple[FieldFrame, bool]:
     """The frame around what the cameras look at, and whether that is all there is: photos with alpha show an object."""
     poses = Rigid3.stack([image.cam_from_world for image in images])
-    middle = focus_point(poses)
-    distances = np.linalg.norm(poses.target_origin_in_source() - middle, axis=1)
+    middle, centers = focus_point(poses), poses.target_origin_in_source()
+    distances = np.linalg.norm(centers - middle, axis=1)
     bounded = all(image.pixels.shape[2] == 4 for image in images)
     radius = (MASKED_RADIUS if bounded else OPEN_RADIUS) * float(np.median(distances))
-    if not radius > 0:
+    if not np.ptp(centers, axis=0).max() > 1e-6 * radius or not radius > 1e-3 * np.ptp(centers, axis=0).max():
         raise InputError("all cameras stand at one place: nothing says how far the scene is; give points or a box")
     frame = frame_around(middle, radius, distances, UNKNOWN)
     return (frame if bounded else replace(frame, near=0.1 * frame.far)), bounded

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
@@ -24,10 +24,11 @@ from fieldstone.io.photos import write_photo
 from fieldstone.io.video import write_gif, write_mp4
 from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
 from fieldstone.render.camera_paths import orbit, spiral, through
-from fieldstone.render.views import render_view
+from fieldstone.render.views import RenderedView, depth_image, normal_image, render_view
 
 PathName = Literal["orbit", "spiral", "through"]
 FilmFormat = Literal["mp4", "gif", "png"]
+Shown = Literal["color", "depth", "normals", "opacity"]
 
 PATHS: dict[str, Callable[[Rigid3, int], Rigid3]] = {"orbit": orbit, "spiral": spiral, "through": through}
 
@@ -37,6 +38,7 @@ def render_run(
     *,
     path: PathName = "orbit",
     fmt: FilmFormat = "mp4",
+    show: Shown = "color",
     frames: int = 120,
     fps: int = 30,
     size_px: int | None = None,
@@ -49,11 +51,13 @@ def render_run(
     Args:
         path: orbit: around what the photos look at. spiral: loops about their mean. through: from photo to photo.
         fmt: mp4 and gif give one file, png a folder of numbered images.
+        show: Colours, depth, normals or opacity.
         size_px: Longer side of the images; None: as trained.
         on_frame: Called with the number of frames done and of all.
 
     Returns:
-        The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/.
+        The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/; PATH_depth and so on for
+        what is not colour.
 
     Raises:
         InputError: No usable checkpoint in `out`.
@@ -68,13 +72,17 @@ def render_run(
     threads = threads or os.cpu_count() or 1
     with open_renderer(header, state_tensors, frame, device=device, threads=threads) as render_normalized:
         render_rays = in_world(render_normalized, frame)
+        scale = frame.normalized_from_world.scale
+        near, far = max(frame.near, 0.01 * frame.far) / scale, frame.far / scale
 
         def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             for k in range(frames):
-                yield quantize(render_view(render_rays, camera, poses_on_path[k]).rgb)
+                view = render_view(render_rays, camera, poses_on_path[k])
+                yield quantize(_shown(view, show, camera, near, far))
                 on_frame(k + 1, frames)
 
-        target = out / "renders" / (path if fmt == "png" else f"{path}.{fmt}")
+        name = path if show == "color" else f"{path}_{show}"
+        target = out / "renders" / (name if fmt == "png" else f"{name}.{fmt}")
         if fmt == "mp4":
             write_mp4(target, images(), fps=fps)
         elif fmt == "gif":
@@ -83,6 +91,16 @@ def render_run(
             for k, image in enumerate(images()):
                 write_photo(target / f"{k:04d}.png", image)
     return target
+
+
+def _shown(view: RenderedView, show: Shown, camera: Camera, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
+    if show == "depth":
+        return depth_image(view, near, far).astype(np.float32)
+    if show == "normals":
+        return normal_image(view, camera).astype(np.float32)
+    if show == "opacity":
+        return np.repeat(view.opacity[:, :, None], 3, axis=2)
+    return view.rgb
 
 
 @contextmanager

@@ -27,6 +27,30 @@ class RenderedView:
     opacity: Float[np.ndarray, "h w"]
 
 
+def depth_image(view: RenderedView, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
+    """Grey values that are linear in 1 / depth, from 1 at `near` to 0 at `far`; black where little is seen."""
+    inverse = 1.0 / np.maximum(view.depth, 1e-12)
+    share = np.clip((inverse - 1.0 / far) / (1.0 / near - 1.0 / far), 0.0, 1.0)
+    return np.repeat(np.where(view.opacity > 0.5, share, 0.0)[:, :, None], 3, axis=2)
+
+
+def normal_image(view: RenderedView, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """(n + 1) / 2 of the normals of the surface that the depth describes; black where little is seen.
+
+    Normals are in the camera frame with OpenGL axes (x right, y up, z to the camera), from central differences of the
+    points that neighbouring pixels see; n points to the camera.
+    """
+    rays = rays_from_view(camera, Rigid3(np.eye(3), np.zeros(3)))
+    points = rays.directions.reshape(*view.depth.shape, 3) * view.depth[:, :, None]
+    with np.errstate(invalid="ignore"):
+        normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+        normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
+    facing = np.sum(normals * points, axis=2, keepdims=True)
+    normals = np.where(facing > 0, -normals, normals) * [1.0, -1.0, -1.0]
+    seen = (view.opacity > 0.5)[:, :, None] & np.isfinite(normals)
+    return np.where(seen, 0.5 + 0.5 * normals, 0.0)
+
+
 def render_view(render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3) -> RenderedView:
     """What the camera sees, with `render_rays` for rays in the world."""
     rays = rays_from_view(camera, cam_from_world)

@@ -1,0 +1,124 @@
+"""What people do wrong, or photos that are no good: a sensible field, or one clear error."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fast_scenes import ball_images
+from fieldstone.cli import main
+from fieldstone.errors import InputError
+from fieldstone.io.photos import write_photo
+from fieldstone.pipeline import fast_fields
+from fieldstone.pipeline.fast_fields import train_fast_run
+
+STEPS = {"finest": 24, "steps": [6] * 8, "num_chunks": 2, "samples_per_chunk": 256}
+
+
+def write_scene(folder, *, edit=lambda images: [image.pixels for image in images], poses=None):
+    """Ten photos of a ball as a transforms.json, with pixels that a test may change."""
+    images = ball_images(10)
+    frames = []
+    for k, (image, pixels) in enumerate(zip(images, edit(images), strict=True)):
+        if pixels is not None:
+            write_photo(folder / f"{image.name}.png", pixels)
+        pose = image.cam_from_world if poses is None else poses[k]
+        matrix = pose.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{image.name}.png", "transform_matrix": matrix.tolist()})
+    (folder / "plan.json").write_text(json.dumps(STEPS))
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    return folder
+
+
+def train(folder, **options):
+    return train_fast_run(folder, folder / "out", plan=folder / "plan.json", threads=1, **options)
+
+
+def one_color(images):
+    return [np.full_like(image.pixels[..., :3], 77) for image in images]
+
+
+def mixed_alpha(images):
+    return [image.pixels if k % 2 else image.pixels[..., :3] for k, image in enumerate(images)]
+
+
+def some_missing(images):
+    return [None if k in (2, 3) else image.pixels for k, image in enumerate(images)]
+
+
+def several_sizes(images):
+    return [image.pixels if k % 2 else image.pixels[::2, ::2] for k, image in enumerate(images)]
+
+
+@pytest.mark.parametrize("edit", [one_color, mixed_alpha, some_missing, several_sizes])
+def test_odd_photos_still_make_a_field(tmp_path, edit):
+    metrics = train(write_scene(tmp_path, edit=edit))
+    assert np.isfinite(metrics["psnr"])
+    if edit is one_color:
+        # There is nothing to learn but one colour, and the background has it.
+        assert metrics["psnr"] > 25
+
+
+def test_photos_of_one_pixel_are_refused(tmp_path):
+    folder = write_scene(tmp_path, edit=lambda images: [image.pixels[:1, :1] for image in images])
+    with pytest.raises(InputError, match="smaller than 11"):
+        train(folder)
+
+
+def test_photos_without_a_common_place_are_refused_or_learned(tmp_path):
+    """Cameras side by side that look the same way: their axes never meet."""
+    images = ball_images(10)
+    pose = images[0].cam_from_world
+    poses = [type(pose)(pose.R, pose.t + [0.5 * k, 0.0, 0.0]) for k in range(10)]
+    metrics = train(write_scene(tmp_path, edit=lambda images: [i.pixels[..., :3] for i in images], poses=poses))
+    assert np.isfinite(metrics["psnr"])
+
+
+def test_cameras_at_one_place_are_refused(tmp_path):
+    images = ball_images(10)
+    poses = [type(image.cam_from_world)(image.cam_from_world.R, np.zeros(3)) for image in images]
+    with pytest.raises(InputError, match="one place"):
+        train(write_scene(tmp_path, poses=poses))
+
+
+def test_a_budget_of_a_second_makes_a_field(tmp_path):
+    folder = write_scene(tmp_path)
+    metrics = train_fast_run(folder, folder / "out", budget_s=1.0, threads=1)
+    assert metrics["steps"] >= 1
+    assert (folder / "out" / "checkpoint.safetensors").is_file()
+    assert (folder / "out" / "preview.png").is_file()
+
+
+def test_too_little_memory_is_an_error(tmp_path):
+    folder = write_scene(tmp_path)
+    with pytest.raises(InputError, match="--memory"):
+        train_fast_run(folder, folder / "out", budget_s=1.0, threads=1, memory_gib=1e-5)
+
+
+def test_less_memory_means_coarser_grids(tmp_path):
+    folder = write_scene(tmp_path)
+    metrics = train_fast_run(folder, folder / "out", budget_s=1.0, threads=1, memory_gib=1e-3)
+    # 48 bytes a vertex.
+    assert 48 * metrics["plan"]["finest"] ** 3 < 2e-3 * 2**30
+
+
+def test_a_full_disk_at_checkpoint_time_is_one_line(tmp_path, monkeypatch, capsys):
+    folder = write_scene(tmp_path)
+
+    def full(path, tensors, header):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(fast_fields, "write_checkpoint", full)
+    arguments = ["train", str(folder), "-o", str(folder / "out"), "--plan", str(folder / "plan.json"), "--threads", "1"]
+    assert main(arguments) == 5
+    error = capsys.readouterr().err
+    assert "No space left" in error
+    assert error.count("\n") == 1
+
+
+def test_a_checkpoint_of_another_kind_is_refused(tmp_path):
+    folder = write_scene(tmp_path)
+    (folder / "out").mkdir()
+    (folder / "out" / "checkpoint.safetensors").write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="checkpoint"):
+        train(folder)
