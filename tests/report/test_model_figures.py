@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
+from scipy.spatial import KDTree
 
+from drawn_figures import borders, drawn, pixels, positions, segments, tolerance, words
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
 from fieldstone.report.model_figures import (
+    NAME_SIZE,
     bundle_overlay_figure,
     four_poses_figure,
     from_above_figure,
@@ -22,12 +24,11 @@ from fieldstone.report.model_figures import (
     upright_frame,
     viewpoint,
 )
-from fieldstone.report.theme import DARK, LIGHT, drawn_pixels
+from fieldstone.report.theme import LIGHT, LIGHTBOX
 from fieldstone.scene.alignment import transformed
 from fieldstone.scene.reconstruction import Points, Reconstruction
 from fieldstone.scene.tracks import Observations
 from fieldstone.synthetic.scenes import Layout, SceneOptions, synthesize
-from figure_artists import drawn, offsets, segments
 
 
 def truth_of(layout: Layout = "arc", **options) -> Reconstruction:
@@ -72,21 +73,42 @@ def test_from_above_draws_every_point_where_it_is_and_ignores_far_outliers():
     truth = truth_of()
     far = replace_points(truth, np.concatenate([truth.points.xyz, [[0.0, 1e4, 0.0], [-1e5, 0.0, 3.0]]]))
     figure = from_above_figure(far)
-    plan = (far.points.xyz @ upright_frame(far).T)[:, :2]
-    np.testing.assert_allclose(np.sort(offsets(figure, "points"), axis=0), np.sort(plan, axis=0))
-    (axes,) = figure.axes
-    assert np.ptp(axes.get_xlim()) < 30
-    assert np.ptp(axes.get_ylim()) < 30
-    inside = axes.viewLim.padded(1e-9)
-    assert all(inside.contains(x, y) for x, y in segments(figure, "frusta").reshape(-1, 2))
-    box = axes.get_position().size * figure.get_size_inches()
-    assert np.ptp(axes.get_xlim()) / box[0] == pytest.approx(np.ptp(axes.get_ylim()) / box[1])  # equal units
-    assert {a.get_text() for a in drawn(figure, "name")} <= {v.name for v in truth.views}
-    drawn_pixels(figure)  # places the names
-    names = [Text.get_window_extent(a) for a in drawn(figure, "name")]  # without the line to the camera
+    left, _, width, height, x0, x1, y0, y1 = borders(figure, 0)
+    assert 0 < x1 - x0 < 30
+    assert 0 < y1 - y0 < 30
+    assert (x1 - x0) / width == pytest.approx((y1 - y0) / height)  # equal units
+    plan = (truth.points.xyz @ upright_frame(far).T)[:, :2]
+    inside = plan[np.all((plan > [x0, y0]) & (plan < [x1, y1]), axis=1)]
+    assert len(inside) > 0.8 * len(plan)
+    assert_dots_at(cloud_of(figure), (inside - [x0, y1]) / [x1 - x0, y0 - y1])
+    frusta = segments(figure, "frusta")
+    assert frusta.shape == (5 * 8, 2, 2)
+    assert np.all((frusta > [x0, y0]) & (frusta < [x1, y1]))
+    names = [(float(e.get("x", "")), float(e.get("y", "")), "".join(e.itertext())) for e in drawn(figure, "name")]
     assert len(names) >= 3
-    assert not any(a.overlaps(b) for k, a in enumerate(names) for b in names[:k])
-    assert all(axes.bbox.x0 <= a.x0 and a.x1 <= axes.bbox.x1 for a in names)
+    assert {name for _, _, name in names} <= {v.name for v in truth.views}
+    for k, (x, y, name) in enumerate(names):
+        half = 0.3 * NAME_SIZE * len(name)  # letters are some 0.6 of their size wide
+        assert left <= x - half
+        assert x + half <= left + width
+        for x2, y2, name2 in names[:k]:
+            assert abs(y - y2) >= NAME_SIZE or abs(x - x2) >= half + 0.3 * NAME_SIZE * len(name2)
+
+
+def cloud_of(figure: str) -> np.ndarray:
+    """The pixels of the cloud, as distances from the ground's colour."""
+    (image,) = drawn(figure, "points")
+    shown = pixels(image).astype(int)
+    return np.abs(shown - [int(LIGHTBOX.paper[k : k + 2], 16) for k in (1, 3, 5)]).max(axis=2)
+
+
+def assert_dots_at(cloud: np.ndarray, places: np.ndarray) -> None:
+    """There is a dot at each place (in shares of the picture's width and height), and none elsewhere."""
+    height, width = cloud.shape
+    at = np.floor(places * [width, height]).astype(int)
+    assert cloud[at[:, 1], at[:, 0]].min() > 40
+    distance = KDTree(places * [width, height]).query(np.argwhere(cloud > 40)[:, ::-1] + 0.5)[0]
+    assert distance.max() < 10  # pixels: the largest radius, and the border of dots whose centre is outside
 
 
 def replace_points(model: Reconstruction, xyz: np.ndarray) -> Reconstruction:
@@ -102,22 +124,25 @@ def test_perspective_is_a_projection_that_shows_the_scene_from_behind_and_above(
     assert (eye - target) @ forward < 0 < (eye - target) @ up
     figure = perspective_figure(truth)
     in_eye = eye_from_world.apply(truth.points.xyz)
-    np.testing.assert_allclose(
-        offsets(figure, "points"), (in_eye[:, :2] / in_eye[:, 2:])[np.argsort(-in_eye[:, 2], kind="stable")]
-    )
+    *_, x0, x1, y0, y1 = borders(figure, 0)
+    places = (in_eye[:, :2] / in_eye[:, 2:] - [x0, y1]) / [x1 - x0, y0 - y1]
+    assert_dots_at(cloud_of(figure), places[np.all((places > 0) & (places < 1), axis=1)])
     assert segments(figure, "frusta").shape == (5 * 8, 2, 2)
 
 
 def test_four_poses_count_the_points_in_front_and_mark_the_chosen_one(run):
     initial = run.initial_pair
     figure = four_poses_figure(initial, ("a.png", "b.png"))
-    assert len(figure.axes) == 4
-    for k, axes in enumerate(figure.axes):
+    titles = words(figure)
+    assert len(titles) == 4
+    assert len(drawn(figure, "chosen")) == 1
+    for k, title in enumerate(titles):
         front = in_front_of_both(initial.candidates[k], initial.points[k])
         assert front.sum() == initial.in_front[k]
-        np.testing.assert_allclose(offsets(figure, "front", k), initial.points[k][front][:, [0, 2]])
-        np.testing.assert_allclose(offsets(figure, "behind", k), initial.points[k][~front][:, [0, 2]])
-        title = axes.get_title(loc="left")
+        for name, mask in (("front", front), ("behind", ~front)):
+            points = initial.points[k][mask][:, [0, 2]]
+            near = np.all(np.abs(points) < 100, axis=1)  # those far outside of the page are clipped
+            np.testing.assert_allclose(positions(figure, name, k)[near], points[near], atol=tolerance(figure, k))
         assert f"{initial.in_front[k]} of {len(front)} in front" in title
         assert title.startswith("chosen") == (k == initial.chosen)
 
@@ -144,10 +169,18 @@ def test_overlay_shows_how_far_each_camera_moved():
     views[2] = type(views[2])(views[2].name, views[2].camera, turned)
     before = Reconstruction(truth.cameras, tuple(views), truth.points, truth.observations)
     figure = bundle_overlay_figure(before, truth)
-    lengths = [bar.get_width() for bar in drawn(figure, "moves-1")][::-1]  # bars from top to bottom
+    bars = drawn(figure, "moves-1")
+    tops = [float(bar.get("y", "")) for bar in bars]
+    assert tops == sorted(tops)
+    lengths = np.array([float(bar.get("width", "")) for bar in bars])
     # One camera of five turned by 0.02 rad; the best common rotation takes a fifth of it.
-    np.testing.assert_allclose(lengths, np.rad2deg([0.004, 0.004, 0.016, 0.004, 0.004]), rtol=1e-3)
-    assert len(offsets(figure, "points-before")) == len(offsets(figure, "points-after")) == len(truth.points)
+    np.testing.assert_allclose(lengths / lengths[2], [0.25, 0.25, 1.0, 0.25, 0.25], rtol=1e-3)
+    marks = [e for e in drawn(figure, "tick") if float(e.get("x", "")) >= float(bars[0].get("x", ""))]
+    (zero, first), degrees = (float(e.get("x", "")) for e in marks[:2]), float("".join(marks[1].itertext()))
+    assert lengths[2] / (first - zero) * degrees == pytest.approx(np.rad2deg(0.016), rel=1e-3)
+    plan = (truth.points.xyz @ upright_frame(truth).T)[:, :2]
+    np.testing.assert_allclose(positions(figure, "points-after"), plan, atol=tolerance(figure))
+    assert len(positions(figure, "points-before")) == len(plan)
 
 
 def test_small_and_empty_models_are_drawn():
@@ -156,5 +189,5 @@ def test_small_and_empty_models_are_drawn():
     one = Reconstruction(truth.cameras, truth.views[:1] + unregistered[1:], *nothing())
     none = Reconstruction(truth.cameras, unregistered, *nothing())
     for model in (one, none):
-        for figure in (from_above_figure(model, theme=DARK), perspective_figure(model, theme=LIGHT)):
-            drawn_pixels(figure)
+        for figure in (from_above_figure(model), perspective_figure(model, theme=LIGHT)):
+            assert len(drawn(figure, "points")) == 1

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib import colormaps
-from matplotlib.colors import LinearSegmentedColormap, to_hex
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from fieldstone.mapping.record import StageRecord
-from fieldstone.report.theme import (
-    FONT,
-    LIGHT,
-    LIGHTBOX,
-    PHOTO_DPI,
-    Theme,
-    label,
-    luminance,
-    mixed,
-    new_figure,
-    set_title,
-    style_axes,
-    style_legend,
-)
+from fieldstone.report import raster, svg
+from fieldstone.report.panel import TITLE_RISE, Panel, axes, title, whole_ticks
+from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, label, luminance, mixed, rgb_of
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 
@@ -39,32 +26,47 @@ COMPARISONS = (
 
 DIFFERENCE_GAIN = 4.0
 MOST_LABELLED = 12
+MOST_MARKED = 40
+"""Longer curves have no dots at their values."""
+VIEW_QUALITY = 90
+"""Of rendered views, whose faults are what one looks for."""
 
 
-def error_histograms_figure(records: Sequence[StageRecord], *, theme: Theme = LIGHT) -> Figure:
+def error_histograms_figure(records: Sequence[StageRecord], *, theme: Theme = LIGHT) -> str:
     """Histograms of the reprojection errors of all photos, stages that belong together in one panel; log axis."""
-    figure = new_figure(11.2, 3.5, theme)
     bins = np.geomspace(0.01, 100.0, 49)
     recorded = {record.stage for record in records if len(record.errors())}
-    panels = [(title, stages) for title, stages in COMPARISONS if recorded & set(stages)]
-    for k, (title, stages) in enumerate(panels):
-        axes = figure.add_axes((0.05 + k * 0.965 / len(panels), 0.15, 0.965 / len(panels) - 0.04, 0.74))
-        style_axes(axes, theme, title=title, x="reprojection error (px)", y="observations" if k == 0 else "")
+    compared = [(words, stages) for words, stages in COMPARISONS if recorded & set(stages)]
+    column = 1080.0 / max(len(compared), 1)
+    parts = []
+    for k, (words, stages) in enumerate(compared):
+        shown = []
         for stage, color in zip(stages, (theme.second, theme.third, theme.first)[-len(stages) :], strict=True):
             errors = errors_of(records, stage)
-            if not len(errors):
-                continue  # the other stages of the panel are there
-            counts, _ = np.histogram(np.clip(errors, bins[0], bins[-1]), bins)
-            name = f"{stage}, median {np.median(errors):.2f}"
-            axes.stairs(counts, bins, fill=True, color=color, alpha=0.22)
-            axes.stairs(counts, bins, color=color, linewidth=1.5, label=name, gid=stage)
-        axes.set_xscale("log")
-        axes.set_xlim(bins[0], bins[-1])
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.minorticks_off()
-        axes.set_ylim(0, axes.get_ylim()[1] * 1.28)
-        style_legend(axes, theme, location="upper left")
-    return figure
+            if len(errors):  # else the other stages of the panel are there
+                counts, _ = np.histogram(np.clip(errors, bins[0], bins[-1]), bins)
+                shown.append((stage, color, counts, f"{stage}, median {np.median(errors):.2f}"))
+        highest = 1.28 * max(int(counts.max()) for _, _, counts, _ in shown)
+        panel = Panel(
+            62.0 + k * column, 38.0, column - 62.0, 258.0, x=(bins[0], bins[-1]), y=(0.0, highest), log_x=True
+        )
+        inside = []
+        for row, (stage, color, counts, name) in enumerate(shown):
+            outline = panel.place(_stairs(counts, bins))
+            inside.append(svg.polygon(outline, color, f"{stage}-area", opacity=0.22))
+            inside.append(svg.polyline(outline, color, 2.0, stage))
+            x, y = panel.left + 14.0, panel.top + 14.0 + 17.0 * row
+            inside.append(svg.segments(np.array([[[x, y], [x + 20.0, y]]]), color, 2.4, "legend"))
+            inside.append(svg.text((x + 28.0, y + 4.0), name, theme.ink, size=11.5))
+        label_y = "observations" if k == 0 else ""
+        parts += [axes(panel, theme, x="reprojection error (px)", y=label_y, y_ticks=whole_ticks(panel.y))]
+        parts += [title(panel, words, theme), panel.clipped(inside)]
+    return svg.page(1120.0, 350.0, theme, parts)
+
+
+def _stairs(counts: Int[np.ndarray, "n"], borders: Float[np.ndarray, "n+1"]) -> Float[np.ndarray, "m 2"]:
+    """The outline of a histogram, from zero to zero."""
+    return np.stack([np.repeat(borders, 2), np.concatenate([[0], np.repeat(counts, 2), [0]])], axis=1)
 
 
 def errors_of(records: Sequence[StageRecord], stage: str) -> Float[np.ndarray, "n"]:
@@ -72,33 +74,39 @@ def errors_of(records: Sequence[StageRecord], stage: str) -> Float[np.ndarray, "
     return np.concatenate([record.errors() for record in records if record.stage == stage] or [np.empty(0)])
 
 
-def match_matrix_figure(graph: MatchGraph, *, theme: Theme = LIGHT) -> Figure:
+def match_matrix_figure(graph: MatchGraph, *, theme: Theme = LIGHT) -> str:
     """Matches between every two photos: above the diagonal as given, below it those kept by RANSAC."""
-    figure = new_figure(5.6, 4.6, theme)
-    axes = figure.add_axes((0.17, 0.12, 0.7, 0.82))
-    style_axes(axes, theme, grid=False)
-    counts = match_counts(graph)
-    ramp = LinearSegmentedColormap.from_list("matches", [mixed(theme.paper, theme.first, 0.06), theme.first])
-    image = axes.imshow(np.ma.masked_equal(counts, 0), cmap=ramp, vmin=0, vmax=max(int(counts.max(initial=0)), 1))
-    n = graph.num_images
-    ticks = np.arange(n) if n <= MOST_LABELLED else np.linspace(0, n - 1, 6).astype(np.int64)
-    names = [label(graph.names[i], 14) for i in ticks]
-    axes.set_xticks(ticks)
-    axes.set_xticklabels(names, rotation=30 if n > 5 else 0, ha="right" if n > 5 else "center", parse_math=False)
-    axes.set_yticks(ticks)
-    axes.set_yticklabels(names, parse_math=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    counts, n = match_counts(graph), graph.num_images
+    panel = Panel(100.0, 20.0, 372.0, 372.0, x=(-0.5, n - 0.5), y=(n - 0.5, -0.5))
+    low, high = (np.array(rgb_of(c)) for c in (mixed(theme.paper, theme.first, 0.06), theme.first))
+    share = counts / max(int(counts.max(initial=0)), 1)
+    cells = np.round(low + share[:, :, None] * (high - low)).astype(np.uint8)
+    cells[counts == 0] = rgb_of(theme.paper)
+    parts = [panel.clipped([svg.picture(raster.encode_png(cells), panel.box, "cells", blocky=True)])]
+    shown = range(n) if n <= MOST_LABELLED else np.linspace(0, n - 1, 6).astype(np.int64).tolist()
+    for i in shown:
+        name = label(graph.names[i], 14)
+        x, y = panel.place(np.array([i, i])).tolist()
+        parts.append(svg.text((panel.left - 8.0, y + 4.0), name, theme.muted, size=11.0, anchor="end"))
+        at, anchor, turned_deg = (
+            ((x + 4.0, panel.bottom + 16.0), "end", -30.0) if n > 5 else ((x, panel.bottom + 16.0), "middle", 0.0)
+        )
+        parts.append(svg.text(at, name, theme.muted, size=11.0, anchor=anchor, turned_deg=turned_deg))
     if n <= MOST_LABELLED:
         for i, j in np.argwhere(counts > 0).tolist():
-            cell = luminance(to_hex(ramp(counts[i, j] / counts.max())))
-            color = max((theme.paper, theme.ink), key=lambda c: abs(luminance(c) - cell))
-            axes.text(j, i, str(counts[i, j]), ha="center", va="center", color=color, fontsize=8.5, family=FONT)
+            cell = "#{:02x}{:02x}{:02x}".format(*cells[i, j].tolist())
+            color = max((theme.paper, theme.ink), key=lambda c: abs(luminance(c) - luminance(cell)))
+            x, y = panel.place(np.array([j, i])).tolist()
+            size = 12.0 if n <= 8 else 10.5
+            parts.append(svg.text((x, y + 4.0), str(counts[i, j]), color, size=size, anchor="middle", name="count"))
     else:
-        bar = figure.colorbar(image, cax=figure.add_axes((0.9, 0.2, 0.02, 0.66)))
-        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-        bar.ax.tick_params(colors=theme.muted, labelsize=8, length=0)
-    return figure
+        bar = Panel(panel.right + 26.0, 40.0, 12.0, 332.0, y=(0.0, float(counts.max())))
+        ramp = np.round(high + np.linspace(0.0, 1.0, 128)[:, None, None] * (low - high)).astype(np.uint8)
+        parts.append(svg.picture(raster.encode_png(ramp), bar.box, "ramp"))
+        for value in whole_ticks(bar.y):
+            _, y = bar.place(np.array([0.0, value])).tolist()
+            parts.append(svg.text((bar.right + 6.0, y + 4.0), f"{value:.0f}", theme.muted, size=11.0))
+    return svg.page(560.0, 460.0, theme, parts)
 
 
 def match_counts(graph: MatchGraph) -> Int[np.ndarray, "n n"]:
@@ -110,53 +118,72 @@ def match_counts(graph: MatchGraph) -> Int[np.ndarray, "n n"]:
     return counts
 
 
-def track_lengths_figure(observations: Observations, *, theme: Theme = LIGHT) -> Figure:
+def track_lengths_figure(observations: Observations, *, theme: Theme = LIGHT) -> str:
     """In how many photos the points are seen."""
-    figure = new_figure(5.6, 4.6, theme)
-    axes = figure.add_axes((0.13, 0.12, 0.84, 0.8))
-    style_axes(axes, theme, x="photos that see the point", y="points")
-    axes.grid(False, axis="x")
     lengths = np.bincount(observations.point) if len(observations) else np.zeros(3, dtype=np.int64)
-    counts = np.bincount(lengths[lengths > 0], minlength=3)
-    length = np.arange(2, len(counts))
-    bars = axes.bar(length, counts[2:], color=theme.first, width=0.7, gid="lengths")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if len(length) <= MOST_LABELLED:
-        axes.bar_label(bars, color=theme.muted, fontsize=8.5, padding=2, family=FONT)
-    return figure
+    counts = np.bincount(lengths[lengths > 0], minlength=3)[2:]
+    longest = len(counts) + 1
+    panel = Panel(
+        72.0, 30.0, 472.0, 376.0, x=(1.5, longest + 0.5), y=(0.0, 1.08 * max(int(counts.max()), 1))
+    )  # fmt: skip
+    parts = [
+        axes(
+            panel, theme, x="photos that see the point", y="points",
+            x_ticks=whole_ticks(panel.x, 12), y_ticks=whole_ticks(panel.y),
+        )
+    ]  # fmt: skip
+    for length, count in enumerate(counts.tolist(), start=2):
+        corners = panel.place(np.array([[length - 0.35, count], [length + 0.35, 0.0]]))
+        (left, top), (right, bottom) = corners.tolist()
+        parts.append(svg.rectangle((left, top, right - left, bottom - top), theme.first, "lengths"))
+        if len(counts) <= MOST_LABELLED:
+            at = ((left + right) / 2, top - 5.0)
+            parts.append(svg.text(at, str(count), theme.muted, size=11.0, anchor="middle", name="count"))
+    return svg.page(560.0, 460.0, theme, parts)
 
 
-def training_figure(curve: Sequence[Mapping[str, Any]], *, theme: Theme = LIGHT) -> Figure:
+def training_figure(curve: Sequence[Mapping[str, Any]], *, theme: Theme = LIGHT) -> str:
     """Loss and PSNR over the seconds of training; entries without a finite value are left out."""
-    figure = new_figure(11.2, 3.4, theme)
-    panels = (("loss", "training loss", theme.second), ("psnr", "PSNR (dB)", theme.first))
-    for k, (key, name, color) in enumerate(panels):
-        axes = figure.add_axes((0.06 + 0.5 * k, 0.16, 0.42, 0.72))
-        style_axes(axes, theme, x="seconds", title=name)
+    parts = []
+    for k, (key, words, color) in enumerate(
+        (("loss", "training loss", theme.second), ("psnr", "PSNR (dB)", theme.first))
+    ):
         rows = [
             (row["seconds"], row[key]) for row in curve if _is_number(row.get(key)) and _is_number(row.get("seconds"))
         ]
+        panel = Panel(68.0 + 560.0 * k, 40.0, 470.0, 244.0)
         if not rows:
-            axes.text(0.5, 0.5, "not recorded", transform=axes.transAxes, ha="center", color=theme.muted, family=FONT)
+            center = (panel.left + panel.width / 2, panel.top + panel.height / 2)
+            parts.append(svg.text(center, "not recorded", theme.muted, anchor="middle"))
+            parts += [axes(panel, theme, x_ticks=[], y_ticks=[]), title(panel, words, theme)]
             continue
-        seconds, values = np.array(rows, dtype=np.float64).T
-        marker = "o" if len(rows) <= 40 else ""
-        axes.plot(seconds, values, color=color, linewidth=1.4, marker=marker, markersize=3.5, gid=key)
-        if key == "loss" and values.min() > 0 and values.max() > 20 * values.min():
-            axes.set_yscale("log")
+        values = np.array(rows, dtype=np.float64)
+        low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+        is_log = key == "loss" and low[1] > 0 and high[1] > 20 * low[1]
+        y = (low[1] / 1.3, high[1] * 1.3) if is_log else _widened(low[1], high[1])
+        panel = replace(panel, x=_widened(low[0], high[0]), y=y, log_y=is_log)
+        on_page = panel.place(values)
+        inside = [svg.polyline(on_page, color, 1.9, key)]
+        if len(rows) <= MOST_MARKED:
+            inside.append(svg.dots(on_page, color, 5.0, f"{key}-values"))
         if key == "psnr":
-            axes.annotate(
-                f"{values[-1]:.2f} dB", (seconds[-1], values[-1]), xytext=(-4, -14), textcoords="offset points",
-                ha="right", color=theme.ink, fontsize=9, family=FONT,
-            )  # fmt: skip
-    return figure
+            at = (on_page[-1, 0] - 5.0, on_page[-1, 1] + 20.0)
+            inside.append(svg.text(at, f"{values[-1, 1]:.2f} dB", theme.ink, anchor="end"))
+        parts += [axes(panel, theme, x="seconds"), title(panel, words, theme), panel.clipped(inside)]
+    return svg.page(1120.0, 340.0, theme, parts)
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    """Limits with some room around the values."""
+    room = 0.05 * (high - low) or max(abs(low), 1.0) * 0.05
+    return low - room, high + room
 
 
 def rendered_views_figure(
     views: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"], UInt8[np.ndarray, "_ _ 3"], str]],
     *,
     theme: Theme = LIGHTBOX,
-) -> Figure:
+) -> str:
     """Rows of (name, true view, rendered view, score): the true view, the rendered one, and their difference.
 
     The difference is the mean over channels of |rendered - true|, drawn `DIFFERENCE_GAIN` times as strong.
@@ -169,28 +196,25 @@ def rendered_views_figure(
     for name, true, rendered, _ in views:
         if true.shape != rendered.shape:
             raise ValueError(f"view {name!r} is {true.shape} and was rendered at {rendered.shape}")
-    width, gap, margin, title = 10.8, 0.12, 0.12, 0.34
+    width, gap, margin = 1080.0, 12.0, 12.0
     column = (width - 2 * margin - 2 * gap) / 3
-    heights = [column * true.shape[0] / true.shape[1] for _, true, _, _ in views]
-    total = sum(heights) + len(views) * title + margin
-    figure = new_figure(width, total, theme, dpi=PHOTO_DPI)
-    top = total
-    for (name, true, rendered, score), height in zip(views, heights, strict=True):
-        top -= title
+    parts, top = [], 0.0
+    for name, true, rendered, score in views:
+        top += 34.0
+        height = column * true.shape[0] / true.shape[1]
         panels = (
             (label(name), true),
             (f"rendered: {score}" if score else "rendered", rendered),
             (f"difference ×{DIFFERENCE_GAIN:g}", difference_image(true, rendered)),
         )
-        for k, (text, image) in enumerate(panels):
+        for k, (words, image) in enumerate(panels):
             left = margin + k * (column + gap)
-            axes = figure.add_axes((left / width, (top - height) / total, column / width, height / total))
-            small_image = image.shape[1] < column * PHOTO_DPI
-            axes.imshow(image, interpolation="nearest" if small_image else "antialiased", aspect="auto")
-            axes.set_axis_off()
-            set_title(axes, text, theme, size=9.5)
-        top -= height
-    return figure
+            encoded = raster.encode_jpeg(raster.small(image, raster.DRAWN_PX), VIEW_QUALITY, full_color=True)
+            parts.append(svg.text((left, top - TITLE_RISE), words, theme.ink, size=12.5, name="title"))
+            is_small = image.shape[1] < column
+            parts.append(svg.picture(encoded, (left, top, column, height), "view", blocky=is_small))
+        top += height
+    return svg.page(width, top + margin, theme, parts)
 
 
 def difference_image(
@@ -198,8 +222,7 @@ def difference_image(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """|rendered - true|, mean over channels, times `DIFFERENCE_GAIN`, from black over red to white."""
     difference = np.abs(rendered.astype(np.int16) - true).mean(axis=2) / 255.0
-    colors = colormaps["inferno"](np.clip(DIFFERENCE_GAIN * difference, 0.0, 1.0))
-    return np.round(255.0 * colors[:, :, :3]).astype(np.uint8)
+    return raster.color_ramp(DIFFERENCE_GAIN * difference, cv2.COLORMAP_INFERNO)
 
 
 def _is_number(value: object) -> bool:

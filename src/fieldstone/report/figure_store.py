@@ -11,22 +11,19 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_bytes, write_json
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from fieldstone.report.theme import Theme
+from fieldstone.io.atomic import write_bytes, write_json, write_text
+from fieldstone.report.raster import encode_jpeg
+from fieldstone.report.theme import DARK, LIGHT, LIGHTBOX, Theme
 
 FORMAT = 1
 Layout = Literal["wide", "half"]
-SAFE_FILE = re.compile(r"[a-z0-9][a-z0-9-]*\.(png|jpg)")
+SAFE_FILE = re.compile(r"[a-z0-9][a-z0-9-]*\.(svg|jpg)")
 """Names that this module writes; an index that names anything else is not ours, and is not followed."""
 
 
@@ -41,9 +38,10 @@ class ReportFigure:
     title: str
     caption: str
     """What one should see in it, in one or two sentences."""
-    draw: Callable[[Theme], Figure]
-    on_photos: bool = False
-    """Drawn once, on a dark ground, as JPEG; else once for a light and once for a dark page, as PNG."""
+    draw: Callable[[Theme], str]
+    """Gives the text of an SVG image."""
+    on_dark: bool = False
+    """Drawn once, on a dark ground, as suits the colours of photos; else once for a light and once for a dark page."""
     layout: Layout = "wide"
 
 
@@ -86,27 +84,21 @@ def write_figures(
     Raises:
         InputError: The folder holds an index that cannot be read, or cannot be made.
     """
-    from fieldstone.report import theme  # matplotlib is slow to import
-
     before = read_index(folder)
     stored: list[StoredFigure] = []
     for figure in figures:
         stem = f"{part}-{figure.key}"
-        dark = None
-        if figure.on_photos:
-            light = f"{stem}.jpg"
-            write_bytes(folder / light, theme.encode_jpeg(theme.drawn_pixels(figure.draw(theme.LIGHTBOX))))
-        else:
-            light, dark = f"{stem}.png", f"{stem}-dark.png"
-            write_bytes(folder / light, theme.encode_png(figure.draw(theme.LIGHT)))
-            write_bytes(folder / dark, theme.encode_png(figure.draw(theme.DARK)))
+        light, dark = f"{stem}.svg", None if figure.on_dark else f"{stem}-dark.svg"
+        write_text(folder / light, figure.draw(LIGHTBOX if figure.on_dark else LIGHT))
+        if dark is not None:
+            write_text(folder / dark, figure.draw(DARK))
         stored.append(StoredFigure(part, figure.section, figure.title, figure.caption, figure.layout, light, dark))
     pictures = before.thumbnails
     if thumbnails is not None:
         pictures = {}
         for number, (name, pixels) in enumerate(thumbnails.items()):
             pictures[name] = f"{part}-thumbnail-{number:04d}.jpg"
-            write_bytes(folder / pictures[name], theme.encode_jpeg(pixels))
+            write_bytes(folder / pictures[name], encode_jpeg(pixels))
     others = [f for f in before.figures if f.part != part]
     index = FigureIndex(tuple(sorted([*others, *stored], key=lambda f: f.part)), pictures)
     content = {"format": FORMAT, "figures": [asdict(f) for f in index.figures], "thumbnails": index.thumbnails}

@@ -17,7 +17,8 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.report import chart_figures, model_figures, photo_figures
 from fieldstone.report.figure_store import ReportFigure
-from fieldstone.report.theme import DRAWN_PX, evenly, small
+from fieldstone.report.raster import DRAWN_PX, small
+from fieldstone.report.theme import evenly
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 PhotoByName = Callable[[str], UInt8[np.ndarray, "_ _ 3"] | None]
@@ -156,7 +157,7 @@ def field_figures(
             "Views that training never saw. Differences should sit on edges and fine texture only; whole areas that "
             "differ mean wrong geometry or colour.",
             lambda theme: chart_figures.rendered_views_figure(rows, theme=theme),
-            on_photos=True,
+            on_dark=True,
         )
 
 
@@ -207,7 +208,7 @@ def _pair_figures(run: MappingRun, photo_of: PhotoByName, options: FigureOptions
             "False matches cross the others or join unlike places. RANSAC should leave lines that move smoothly over "
             "the photo and reject the rest.",
             partial(draw, photo_figures.matches_figure, (i, j)),
-            on_photos=True,
+            on_dark=True,
         )
     for i, j in pairs:
         yield ReportFigure(
@@ -217,7 +218,7 @@ def _pair_figures(run: MappingRun, photo_of: PhotoByName, options: FigureOptions
             "The match of a point must lie on the line of its colour. All lines meet in the epipole, where the second "
             "photo would see the first camera.",
             partial(draw, photo_figures.epipolar_figure, (i, j)),
-            on_photos=True,
+            on_dark=True,
         )
     if start is not None:
         first, second = (graph.names[k] for k in start.pair)
@@ -258,7 +259,7 @@ def _refinement_figures(
             f"Reprojections in {name}: {', '.join(r.stage for r in records)}",
             caption,
             partial(draw, records, camera, name),
-            on_photos=True,
+            on_dark=True,
         )
 
 
@@ -271,6 +272,7 @@ def _model_figures(run: MappingRun) -> Iterator[ReportFigure]:
         "Walls should be thin lines and corners right angles; the outermost 4 % of the points on either side "
         "may lie outside the frame.",
         lambda theme: model_figures.from_above_figure(model, theme=theme),
+        on_dark=True,
         layout="half",
     )
     yield ReportFigure(
@@ -279,6 +281,7 @@ def _model_figures(run: MappingRun) -> Iterator[ReportFigure]:
         "Cameras and points in perspective",
         "Seen from behind and above the cameras. Points should form surfaces that the frusta look at.",
         lambda theme: model_figures.perspective_figure(model, theme=theme),
+        on_dark=True,
         layout="half",
     )
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Bool, Float
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
 from fieldstone.geometry.camera import Camera
@@ -15,19 +13,9 @@ from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import angle_between, nearest_rotation
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.mapping.record import InitialPair
-from fieldstone.report.theme import (
-    FONT,
-    LIGHT,
-    Theme,
-    evenly,
-    label,
-    mixed,
-    new_figure,
-    readable_colors,
-    set_title,
-    style_axes,
-    style_legend,
-)
+from fieldstone.report import raster, svg
+from fieldstone.report.panel import Panel, axes, ticks, title
+from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, evenly, label, mixed, readable_colors, rgb_of
 from fieldstone.scene.alignment import common_poses, transformed
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -35,45 +23,51 @@ MOST_NAMES = 30
 """With more cameras than this, names would cover each other and are left out."""
 MOST_POINTS = 50_000
 """Of more points than this, evenly chosen ones are drawn: a figure has fewer pixels."""
-HALF_IN = (5.6, 4.6)
+PLAN_POINTS = 10_000
+"""The same for the overlay, whose points are drawn one by one."""
+HALF = (560.0, 460.0)
+"""Page units of a figure as wide as half of the page."""
+MOST_BARS = 20
+CLOUD_SCALE = 2.0
+"""Pixels of a cloud per page unit."""
+CLOUD_QUALITY = 88
 PRIOR_OF_MEAN_UP = 0.01
 """Weight of the mean upward axis, beside the mean square of what the rightward axes have along up."""
-NAME_PT = 8.5
+NAME_SIZE = 11.5
 NAME_OFFSETS = ((0, -1), (1, 0), (-1, 0), (0, 1), *((dx, dy) for dy in (-1, 1, -2, 2) for dx in (1, -1)))
 """Places for a name around its camera, the best first: widths of the name to the right, heights up."""
 
 
-def four_poses_figure(initial: InitialPair, names: tuple[str, str], *, theme: Theme = LIGHT) -> Figure:
+def four_poses_figure(initial: InitialPair, names: tuple[str, str], *, theme: Theme = LIGHT) -> str:
     """The candidate poses from above, in the first camera's frame: x to the right, z (its viewing direction) up."""
-    figure = new_figure(11.2, 3.5, theme)
-    count = len(initial.candidates)
+    width, height, count = 1120.0, 350.0, len(initial.candidates)
+    parts = [
+        svg.text((14.0, 20.0), f"camera 1: {label(names[0])}, camera 2: {label(names[1])}", theme.muted, name="names")
+    ]
     for k, (pose, points) in enumerate(zip(initial.candidates, initial.points, strict=True)):
-        axes = figure.add_axes(((k + 0.16) / count, 0.14, 0.8 / count, 0.7))
+        column = width / count
+        box = Panel((k + 0.16) * column, 56.0, 0.8 * column, 245.0)
         front = in_front_of_both(pose, points)
-        style_axes(axes, theme, x="x", y="z" if k == 0 else "")
-        for mask, color, name in ((~front, theme.bad, "behind"), (front, theme.good, "front")):
-            axes.scatter(*points[mask][:, [0, 2]].T, s=4, c=color, alpha=0.6, linewidths=0, gid=name)
+        plan = points[:, [0, 2]]
         cameras = Rigid3.stack([Rigid3.identity(), pose])
         centers, directions = cameras.target_origin_in_source()[:, [0, 2]], cameras.R[:, 2][:, [0, 2]]
-        _set_limits(axes, points[:, [0, 2]], centers, spread=(8.0, 92.0))
-        reach = 0.2 * float(np.ptp(axes.get_xlim()))
+        reach = 0.2 * float(np.ptp(_fitted(box, plan, centers, spread=(8.0, 92.0)).x))
         tips = [centers, centers + reach * directions, centers - 0.3 * reach * directions]
-        _set_limits(axes, points[:, [0, 2]], np.concatenate(tips), spread=(8.0, 92.0))
+        panel = _fitted(box, plan, np.concatenate(tips), spread=(8.0, 92.0))
+        inside = [
+            svg.dots(panel.place(plan[mask]), color, 2.4, name)
+            for mask, color, name in ((~front, theme.bad, "behind"), (front, theme.good, "front"))
+        ]
         for number, color in ((0, theme.first), (1, theme.second)):
-            _plan_camera(axes, cameras[number], reach, color, str(number + 1))
+            inside.append(_plan_camera(panel, cameras[number], reach, color, str(number + 1)))
         is_chosen = k == initial.chosen
-        mark = "chosen: " if is_chosen else ""
         total = int(np.isfinite(points[:, 0]).sum())
-        set_title(axes, f"{mark}{int(initial.in_front[k])} of {total} in front", theme)
-        axes.title.set_gid("title")
+        words = f"{'chosen: ' if is_chosen else ''}{int(initial.in_front[k])} of {total} in front"
+        frame = axes(panel, theme, x="x", y="z" if k == 0 else "", equal_units=True)
+        parts += [frame, panel.clipped(inside), title(panel, words, theme)]
         if is_chosen:
-            for spine in axes.spines.values():
-                spine.set(visible=True, color=theme.good, linewidth=2.2)
-    figure.text(
-        0.012, 0.955, f"camera 1: {label(names[0])}, camera 2: {label(names[1])}",
-        color=theme.muted, fontsize=9, family=FONT, parse_math=False,
-    )  # fmt: skip
-    return figure
+            parts.append(svg.rectangle(panel.box, "none", "chosen", outline=theme.good, width=2.6))
+    return svg.page(width, height, theme, parts)
 
 
 def in_front_of_both(cam2_from_cam1: Rigid3, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
@@ -81,50 +75,47 @@ def in_front_of_both(cam2_from_cam1: Rigid3, points: Float[np.ndarray, "n 3"]) -
     return (points[:, 2] > 0) & (cam2_from_cam1.apply(points)[:, 2] > 0)
 
 
-def from_above_figure(model: Reconstruction, *, theme: Theme = LIGHT) -> Figure:
+def from_above_figure(model: Reconstruction, *, theme: Theme = LIGHTBOX) -> str:
     """Cameras and points from above: the mean upward direction of the photos points at the reader."""
-    figure = new_figure(*HALF_IN, theme)
-    axes = figure.add_axes((0.11, 0.11, 0.86, 0.86))
-    style_axes(axes, theme, x="right (scene units)", y="forward (scene units)")
     plan_from_world = upright_frame(model)
     drawn = evenly(len(model.points), MOST_POINTS)
     points = model.points.xyz[drawn] @ plan_from_world.T
     by_height = np.argsort(points[:, 2], kind="stable")
+    edges = (all_frusta(model, frustum_size(model)) @ plan_from_world.T)[:, :, :2]
+    panel = _fitted(Panel(62.0, 14.0, HALF[0] - 79.0, HALF[1] - 64.0), points[:, :2], edges.reshape(-1, 2))
     colors = readable_colors(model.points.rgb[drawn], theme)
-    axes.scatter(*points[by_height, :2].T, s=5, c=colors[by_height], linewidths=0, alpha=0.9, gid="points")
-    size = frustum_size(model)
-    edges = all_frusta(model, size) @ plan_from_world.T
-    axes.add_collection(LineCollection(list(edges[:, :, :2]), colors=theme.first, linewidths=0.9, gid="frusta"))
-    _set_limits(axes, points[:, :2], edges.reshape(-1, 3)[:, :2])
-    _names(axes, model, model.camera_centers() @ plan_from_world.T, theme)
-    return figure
+    inside = (
+        _cloud(panel, points[by_height, :2], np.full(len(points), 3.2), colors[by_height], theme),
+        axes(panel, theme, x="right (scene units)", y="forward (scene units)", equal_units=True),
+        panel.clipped([svg.segments(panel.place(edges), theme.first, 1.3, "frusta")]),
+        _names(panel, model, panel.place((model.camera_centers() @ plan_from_world.T)[:, :2]), theme),
+    )
+    return svg.page(*HALF, theme, inside)
 
 
-def perspective_figure(model: Reconstruction, *, theme: Theme = LIGHT) -> Figure:
+def perspective_figure(model: Reconstruction, *, theme: Theme = LIGHTBOX) -> str:
     """Cameras and points in perspective, from behind and above the cameras; near points are larger."""
-    figure = new_figure(*HALF_IN, theme)
-    axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
-    axes.set_axis_off()
     eye_from_world = viewpoint(model)
     drawn = evenly(len(model.points), MOST_POINTS)
     points = eye_from_world.apply(model.points.xyz[drawn])
     visible = np.flatnonzero(points[:, 2] > 0.05 * np.median(points[:, 2]) if len(points) else [])
     far_to_near = visible[np.argsort(-points[visible, 2], kind="stable")]
-    pixels = _plane(points[far_to_near])
+    plane = _plane(points[far_to_near])
     nearness = np.median(points[visible, 2]) / points[far_to_near, 2] if len(visible) else np.empty(0)
-    colors = readable_colors(model.points.rgb[drawn], theme)[far_to_near]
-    axes.scatter(*pixels.T, s=np.clip(7.0 * nearness**2, 1.5, 40.0), c=colors, linewidths=0, gid="points")
     edges = eye_from_world.apply(all_frusta(model, frustum_size(model)))
     edges = edges[np.all(edges[:, :, 2] > 0, axis=1)]
     lines = _plane(edges.reshape(-1, 3)).reshape(-1, 2, 2)
-    axes.add_collection(LineCollection(list(lines), colors=theme.first, linewidths=1.0, gid="frusta"))
-    _set_limits(axes, pixels, lines.reshape(-1, 2), y_down=True, margin=1.14)
-    centers = eye_from_world.apply(model.camera_centers())
-    _names(axes, model, np.concatenate([_plane(centers), centers[:, 2:]], axis=1), theme)
-    return figure
+    panel = _fitted(Panel(0.0, 0.0, *HALF), plane, lines.reshape(-1, 2), y_down=True, margin=1.14)
+    colors = readable_colors(model.points.rgb[drawn], theme)[far_to_near]
+    inside = (
+        _cloud(panel, plane, np.clip(3.7 * nearness, 1.7, 8.8), colors, theme),
+        panel.clipped([svg.segments(panel.place(lines), theme.first, 1.4, "frusta")]),
+        _names(panel, model, panel.place(_plane(eye_from_world.apply(model.camera_centers()))), theme),
+    )
+    return svg.page(*HALF, theme, inside)
 
 
-def bundle_overlay_figure(before: Reconstruction, after: Reconstruction, *, theme: Theme = LIGHT) -> Figure:
+def bundle_overlay_figure(before: Reconstruction, after: Reconstruction, *, theme: Theme = LIGHT) -> str:
     """Cameras and points from above before and after bundle adjustment, and how far each camera moved.
 
     The model before is first brought onto the model after by `similarity_between`: that much is free and says nothing.
@@ -133,37 +124,54 @@ def bundle_overlay_figure(before: Reconstruction, after: Reconstruction, *, them
         ValueError: Fewer than two views are registered in both.
     """
     before = transformed(before, similarity_between(before, after))
-    figure = new_figure(11.2, 4.4, theme)
-    axes = figure.add_axes((0.06, 0.12, 0.5, 0.78))
-    style_axes(axes, theme, title="from above", x="right (scene units)", y="forward (scene units)")
     plan_from_world, size = upright_frame(after), frustum_size(after)
-    frusta, points = [], []
-    for model, color, name in ((before, theme.second, "before"), (after, theme.first, "after")):
-        points.append(model.points.xyz[evenly(len(model.points), MOST_POINTS)] @ plan_from_world.T)
+    clouds, frusta = [], []
+    for model in (before, after):
+        clouds.append((model.points.xyz[evenly(len(model.points), PLAN_POINTS)] @ plan_from_world.T)[:, :2])
         frusta.append((all_frusta(model, size) @ plan_from_world.T)[:, :, :2])
-        axes.scatter(*points[-1][:, :2].T, s=4, c=color, linewidths=0, alpha=0.55, gid=f"points-{name}")
-        axes.add_collection(
-            LineCollection(list(frusta[-1]), colors=color, linewidths=1.0, label=name, gid=f"frusta-{name}")
+    panel = _fitted(Panel(67.0, 40.0, 540.0, 345.0), np.concatenate(clouds), np.concatenate(frusta).reshape(-1, 2))
+    shown = (("before", theme.second, 3.0, clouds[0], frusta[0]), ("after", theme.first, 2.2, clouds[1], frusta[1]))
+    inside = [
+        piece
+        for name, color, diameter, cloud, lines in shown
+        for piece in (
+            svg.dots(panel.place(cloud), color, diameter, f"points-{name}"),
+            svg.segments(panel.place(lines), color, 1.4, f"frusta-{name}"),
         )
-    _set_limits(axes, np.concatenate(points)[:, :2], np.concatenate(frusta).reshape(-1, 2))
-    style_legend(axes, theme)
+    ]
+    parts = [
+        axes(panel, theme, x="right (scene units)", y="forward (scene units)", equal_units=True),
+        panel.clipped(inside),
+        title(panel, "from above", theme),
+    ]
+    for k, (name, color, *_) in enumerate(shown):
+        x, y = panel.right - 140.0 + 76.0 * k, panel.top - 13.0
+        parts.append(svg.dots([(x - 9.0, y)], color, 9.0, "legend"))
+        parts.append(svg.text((x, y + 4.0), name, theme.ink))
+    return svg.page(1120.0, 440.0, theme, [*parts, _moves(before, after, theme)])
 
+
+def _moves(before: Reconstruction, after: Reconstruction, theme: Theme) -> str:
+    """Bars of how far the cameras moved and turned: those that moved most, in the order of the photos."""
     poses_before, poses_after, names = common_poses(before, after)
     centers_before, centers_after = poses_before.target_origin_in_source(), poses_after.target_origin_in_source()
     extent = float(np.linalg.norm(np.ptp(centers_after, axis=0)))
     moved = 100.0 * np.linalg.norm(centers_before - centers_after, axis=1) / max(extent, 1e-300)
     turned = np.rad2deg(angle_between(poses_before.R, poses_after.R))
-    shown = np.sort(np.argsort(-moved, kind="stable")[:20])[::-1]
-    for k, (value, title) in enumerate(((moved, "moved (% of camera span)"), (turned, "turned (deg)"))):
-        bars = figure.add_axes((0.655 + 0.18 * k, 0.12, 0.15, 0.78))
-        style_axes(bars, theme, grid=False)
-        set_title(bars, title, theme, size=9.0)
-        bars.barh(np.arange(len(shown)), value[shown], color=theme.first, height=0.6, gid=f"moves-{k}")
-        bars.set_yticks(np.arange(len(shown)))
-        bars.set_yticklabels([label(names[i], 16) if k == 0 else "" for i in shown], parse_math=False)
-        bars.set_xlim(0, max(1.15 * float(value[shown].max(initial=0.0)), 1e-12))
-        bars.xaxis.set_major_locator(MaxNLocator(3))
-    return figure
+    shown = np.sort(np.argsort(-moved, kind="stable")[:MOST_BARS])
+    parts = []
+    for k, (value, words) in enumerate(((moved, "moved (% of camera span)"), (turned, "turned (deg)"))):
+        largest = max(1.15 * float(value[shown].max(initial=0.0)), 1e-12)
+        panel = Panel(732.0 + 206.0 * k, 40.0, 164.0, 345.0, x=(0.0, largest), y=(len(shown) - 0.5, -0.5))
+        marks = ticks(panel.x, count=4)
+        parts += [axes(panel, theme, x_ticks=marks, y_ticks=[], grid=False), title(panel, words, theme, size=12.5)]
+        for row, i in enumerate(shown.tolist()):
+            (left, top), (right, bottom) = panel.place(np.array([[0.0, row - 0.3], [value[i], row + 0.3]])).tolist()
+            parts.append(svg.rectangle((left, top, right - left, bottom - top), theme.first, f"moves-{k}"))
+            if k == 0:
+                at = (left - 7.0, (top + bottom) / 2 + 4.0)
+                parts.append(svg.text(at, label(names[i], 16), theme.muted, size=11.0, anchor="end"))
+    return "".join(parts)
 
 
 def similarity_between(model: Reconstruction, reference: Reconstruction) -> Sim3:
@@ -251,77 +259,88 @@ def frustum_edges(camera: Camera, cam_from_world: Rigid3, size: float) -> Float[
     )
 
 
-def _set_limits(
-    axes: Axes,
+def _cloud(
+    panel: Panel,
+    points: Float[np.ndarray, "n 2"],
+    diameters: Float[np.ndarray, "n"],
+    colors: UInt8[np.ndarray, "n 3"],
+    theme: Theme,
+) -> str:
+    """Points in their own colours as one picture, later ones over earlier ones."""
+    pixels = raster.dots_on_ground(
+        CLOUD_SCALE * (panel.place(points) - [panel.left, panel.top]),
+        CLOUD_SCALE * diameters,
+        colors,
+        (round(CLOUD_SCALE * panel.width), round(CLOUD_SCALE * panel.height)),
+        rgb_of(theme.paper),
+    )
+    return panel.clipped(
+        [svg.picture(raster.encode_jpeg(pixels, CLOUD_QUALITY, full_color=True), panel.box, "points")], "cloud"
+    )
+
+
+def _fitted(
+    box: Panel,
     points: Float[np.ndarray, "n 2"],
     always: Float[np.ndarray, "m 2"],
     *,
     y_down: bool = False,
     margin: float = 1.08,
     spread: tuple[float, float] = (4.0, 96.0),
-) -> None:
-    """Equal units on both axes; the box of `always` and of the points without the outermost per cent of each axis."""
+) -> Panel:
+    """The panel with equal units on both axes that shows `always` and the points without the outermost per cent."""
     finite = points[np.all(np.isfinite(points), axis=1)]
     bulk = np.percentile(finite, spread, axis=0) if len(finite) else np.empty((0, 2))
     both = np.concatenate([bulk, always])
     lower, upper = (both.min(axis=0), both.max(axis=0)) if len(both) else (np.zeros(2), np.ones(2))
     center, half = (lower + upper) / 2, np.maximum((upper - lower) / 2, 1e-9) * margin
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    width, height = axes.get_position().size * figure.get_size_inches()
-    unit = max(half[0] / width, half[1] / height)
-    half = unit * np.array([width, height])
-    axes.set_xlim(center[0] - half[0], center[0] + half[0])
-    y = (center[1] - half[1], center[1] + half[1])
-    axes.set_ylim(y[::-1] if y_down else y)
+    unit = max(half[0] / box.width, half[1] / box.height)
+    low, high = center - unit * np.array([box.width, box.height]), center + unit * np.array([box.width, box.height])
+    y = (float(high[1]), float(low[1])) if y_down else (float(low[1]), float(high[1]))
+    return replace(box, x=(float(low[0]), float(high[0])), y=y)
 
 
-def _plan_camera(axes: Axes, cam_from_world: Rigid3, reach: float, color: str, name: str) -> None:
+def _plan_camera(panel: Panel, cam_from_world: Rigid3, reach: float, color: str, name: str) -> str:
     """A camera from above (x, z): its centre, an opening of 50 deg and its viewing direction."""
     center = cam_from_world.target_origin_in_source()[[0, 2]]
     forward = cam_from_world.R[2][[0, 2]]
     side = np.array([-forward[1], forward[0]]) * np.tan(np.deg2rad(25.0))
     corners = [center, center + reach * 0.6 * (forward + side), center + reach * 0.6 * (forward - side), center]
-    axes.plot(*np.array(corners).T, color=color, linewidth=1.4, zorder=4)
-    axes.annotate(
-        "", tuple(center + reach * forward), xytext=tuple(center), zorder=4,
-        arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0},
-    )  # fmt: skip
-    axes.annotate(
-        name, tuple(center), xytext=(-3, -4), textcoords="offset points", ha="right", va="top",
-        color=color, fontsize=10, weight="bold", family=FONT, zorder=5,
-    )  # fmt: skip
+    tail, tip = panel.place(np.stack([center, center + reach * forward]))
+    at = (tail[0] - 5.0, tail[1] + 14.0)
+    return (
+        svg.polyline(panel.place(np.array(corners)), color, 2.0, "camera")
+        + svg.arrow(tail, tip, color, 1.7, "direction")
+        + svg.text(at, name, color, size=14.0, weight=700, anchor="end", halo="", name="number")
+    )
 
 
-def _names(axes: Axes, model: Reconstruction, positions: Float[np.ndarray, "r k"], theme: Theme) -> None:
+def _names(panel: Panel, model: Reconstruction, on_page: Float[np.ndarray, "r 2"], theme: Theme) -> str:
     """Names beside the cameras, where they cover no other name; those without room are left out."""
     views = model.registered().tolist()
     if len(views) > MOST_NAMES:
-        return
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    points_per_dot = 72.0 / figure.dpi
-    on_page = axes.transData.transform(positions[:, :2]) * points_per_dot
-    left, bottom, right, top = (np.array(axes.bbox.extents) * points_per_dot).tolist()
+        return ""
+    color = mixed(theme.first, theme.ink, 0.35)
     taken: list[tuple[float, float, float, float]] = []
-    for view, position, (x, y) in zip(views, positions, on_page.tolist(), strict=True):
+    lines, words = [], []
+    for view, (x, y) in zip(views, on_page.tolist(), strict=True):
         name = label(model.views[view].name, 16)
-        width, height = 0.66 * NAME_PT * len(name), 1.3 * NAME_PT
+        width, height = 0.66 * NAME_SIZE * len(name), 1.3 * NAME_SIZE
         for dx, dy in NAME_OFFSETS:
-            x0, y0 = x + dx * (12 + width / 2) - width / 2, y + dy * 14 - height / 2
-            box = (x0, y0, x0 + width, y0 + height)
-            is_inside = left <= x0 and box[2] <= right and bottom <= y0 and box[3] <= top
+            center = (x + dx * (16 + width / 2), y - dy * 19)
+            box = (center[0] - width / 2, center[1] - height / 2, center[0] + width / 2, center[1] + height / 2)
+            is_inside = (
+                panel.left <= box[0] and box[2] <= panel.right and panel.top <= box[1] and box[3] <= panel.bottom
+            )
             if is_inside and not any(_overlap(box, other) for other in taken):
                 break
         else:
             continue
         taken.append(box)
-        axes.annotate(
-            name, (position[0], position[1]), xytext=(dx * (12 + width / 2), dy * 14), textcoords="offset points",
-            ha="center", va="center", color=mixed(theme.first, theme.ink, 0.35), fontsize=NAME_PT, family=FONT,
-            parse_math=False, annotation_clip=True, zorder=5, gid="name",
-            arrowprops={"arrowstyle": "-", "color": theme.muted, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1},
-        )  # fmt: skip
+        lines.append([[x, y], [min(max(x, box[0] + 8), box[2] - 8), min(max(y, box[1]), box[3])]])
+        at = (center[0], center[1] + 0.35 * NAME_SIZE)
+        words.append(svg.text(at, name, color, size=NAME_SIZE, anchor="middle", halo=theme.paper, name="name"))
+    return svg.segments(np.array(lines).reshape(-1, 2, 2), theme.muted, 0.8, "leaders") + "".join(words)
 
 
 def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:

@@ -9,37 +9,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.patheffects import Normal, Stroke
 
 from fieldstone.geometry.camera import Camera, image_from_plane, plane_from_image
 from fieldstone.geometry.epipolar import homogeneous
 from fieldstone.mapping.record import StageRecord
-from fieldstone.report.theme import (
-    DRAWN_PX,
-    FONT,
-    LIGHTBOX,
-    PHOTO_DPI,
-    Theme,
-    evenly,
-    label,
-    new_figure,
-    set_title,
-    small,
-)
+from fieldstone.report import raster, svg
+from fieldstone.report.panel import Panel, title
+from fieldstone.report.theme import LIGHTBOX, Theme, evenly, label
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 MaybePhoto = UInt8[np.ndarray, "_ _ 3"] | None
+Extent = tuple[float, float, float, float]
+"""(left, right, bottom, top)."""
 
-WIDTH_IN = 10.8
+WIDTH, MARGIN, GAP, TITLE = 1080.0, 12.0, 12.0, 34.0
+"""Page units: of the figure, around and between its photos, above each row."""
 GAP_PX_SHARE = 0.015
 MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+LONGEST_VECTOR = 4.0 * WIDTH
+"""Page units; longer error vectors leave the photo anyway."""
 
 
 def matches_figure(
@@ -50,7 +41,7 @@ def matches_figure(
     *,
     max_lines: int = 160,
     theme: Theme = LIGHTBOX,
-) -> Figure:
+) -> str:
     """Putative matches of a pair (above), and what RANSAC made of them (below): kept green, rejected red.
 
     Both rows draw the same matches, evenly chosen where there are more than `max_lines`; titles count all.
@@ -59,24 +50,30 @@ def matches_figure(
     pixels1, pixels2 = graph.matched_pixels(pair)
     chosen = evenly(len(inlier), max_lines)
     canvas = _side_by_side(cameras)
-    figure, rows = _panels([canvas, canvas], 1, theme)
+    height, rows = _panels([canvas, canvas], 1)
     segments = np.stack([_placed(pixels1[chosen], cameras, 0), _placed(pixels2[chosen], cameras, 1)], axis=1)
     kept = inlier[chosen]
     drawn = "" if len(chosen) == len(inlier) else f", {len(chosen)} drawn"
     names = f"{label(graph.names[pair[0]])} – {label(graph.names[pair[1]])}"
     rejected = len(inlier) - int(inlier.sum())
     titles = (
-        f"before RANSAC: {len(inlier)} matches{drawn}   {names}",
+        f"before RANSAC: {len(inlier)} matches{drawn} \N{MIDDLE DOT} {names}",
         f"after RANSAC: {int(inlier.sum())} kept (green), {rejected} rejected (red)",
     )
-    for axes, title in zip(rows, titles, strict=True):
-        for side in (0, 1):
-            _show_photo(axes, photos[side], _extent(cameras, side), theme)
-        set_title(axes, title, theme)
-    _add_lines(rows[0], segments, theme.second, "putative")
-    _add_lines(rows[1], segments[~kept], theme.bad, "rejected")
-    _add_lines(rows[1], segments[kept], theme.good, "kept")
-    return figure
+    lines = (
+        (("putative", segments, theme.second),),
+        (("rejected", segments[~kept], theme.bad), ("kept", segments[kept], theme.good)),
+    )
+    extents = [_extent(cameras, side) for side in (0, 1)]
+    parts = [_photo(rows[0], photos[side], extents[side], f"photo-{side}", theme) for side in (0, 1)]
+    for panel, words, groups in zip(rows, titles, lines, strict=True):
+        inside = [svg.used(f"photo-{side}", _corner(panel, extents[side])) for side in (0, 1)]
+        for name, ends, color in groups:
+            on_page = panel.place(ends)
+            inside.append(svg.segments(on_page, color, 1.1, name, opacity=0.75))
+            inside.append(svg.dots(on_page.reshape(-1, 2), color, 3.4, f"{name}-ends"))
+        parts += [title(panel, words, theme), panel.clipped(inside)]
+    return svg.page(WIDTH, height, theme, parts)
 
 
 def epipolar_figure(
@@ -87,7 +84,7 @@ def epipolar_figure(
     *,
     max_lines: int = 12,
     theme: Theme = LIGHTBOX,
-) -> Figure:
+) -> str:
     """Points of the first photo, and in the second the lines on which their matches must lie, in the same colours.
 
     With lens distortion the lines are curves: they are drawn through the camera model.
@@ -96,23 +93,28 @@ def epipolar_figure(
         ValueError: The pair has no epipolar geometry.
     """
     E = essential_of(graph, pair, cameras)
-    pixels1, pixels2 = graph.matched_pixels(pair, graph.inlier_matches(pair))
-    chosen = _spread_out(pixels1, max_lines)
-    figure, axes = _panels([_size(c) for c in cameras], 2, theme)
-    colors = colormaps["turbo"](np.linspace(0.06, 0.94, max(len(chosen), 1)))[: len(chosen)]
-    for side, pixels in enumerate((pixels1, pixels2)):
-        _show_photo(axes[side], photos[side], _whole(cameras[side]), theme)
-        axes[side].scatter(
-            *pixels[chosen].T, s=34, c=colors, edgecolors="white", linewidths=0.8, zorder=4, gid=f"points-{side}"
-        )
-    for color, curve in zip(colors, epipolar_curves(E, cameras, pixels1[chosen]), strict=True):
-        axes[1].plot(*curve.T, color=color, linewidth=1.3, zorder=3, gid="epipolar-line")
-    _mark_epipole(axes[1], epipole(E, cameras[1]), cameras[1], theme)
-    distance = distance_to_curves(E, cameras, pixels1, pixels2)
+    pixels = graph.matched_pixels(pair, graph.inlier_matches(pair))
+    chosen = _spread_out(pixels[0], max_lines)
+    distance = distance_to_curves(E, cameras, *pixels)
     typical = f", median distance {np.median(distance):.2f} px of {len(distance)} matches" if len(distance) else ""
-    set_title(axes[0], f"points in {label(graph.names[pair[0]])}", theme)
-    set_title(axes[1], f"their lines in {label(graph.names[pair[1]])}{typical}", theme)
-    return figure
+    first, second = (label(graph.names[k]) for k in pair)
+    titles = (f"points in {first}", f"their lines in {second}{typical}")
+    height, panels = _panels([_size(c) for c in cameras], 2)
+    ramp = raster.color_ramp(np.linspace(0.06, 0.94, max(len(chosen), 1)), cv2.COLORMAP_TURBO)
+    colors = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in ramp[: len(chosen)].tolist()]
+    extents = [_whole(camera) for camera in cameras]
+    parts = [_photo(panels[side], photos[side], extents[side], f"photo-{side}", theme) for side in (0, 1)]
+    for side, (panel, words) in enumerate(zip(panels, titles, strict=True)):
+        inside = [svg.used(f"photo-{side}", _corner(panel, extents[side]))]
+        if side == 1:
+            for color, curve in zip(colors, epipolar_curves(E, cameras, pixels[0][chosen]), strict=True):
+                inside.append(svg.polyline(panel.place(curve), color, 1.8, "epipolar-line"))
+        for color, center in zip(colors, panel.place(pixels[side][chosen]).tolist(), strict=True):
+            inside.append(svg.circle((center[0], center[1]), 8.5, color, f"point-{side}", outline="white", width=1.1))
+        if side == 1:
+            inside.append(_epipole_mark(panel, epipole(E, cameras[1]), cameras[1], theme))
+        parts += [title(panel, words, theme), panel.clipped(inside)]
+    return svg.page(WIDTH, height, theme, parts)
 
 
 def reprojections_figure(
@@ -122,36 +124,40 @@ def reprojections_figure(
     *,
     max_points: int = 350,
     theme: Theme = LIGHTBOX,
-) -> Figure:
+) -> str:
     """One photo at two or more stages: observed pixels as crosses, error vectors to dots, the reprojections.
 
     Vectors are drawn `magnification` times as long as they are, alike in all panels, so that panels compare.
     """
     scale = magnification(records, camera.width)
-    figure, panels = _panels([_size(camera)] * len(records), len(records), theme)
-    for axes, record in zip(panels, records, strict=True):
-        _show_photo(axes, photo, _whole(camera), theme)
+    height, panels = _panels([_size(camera)] * len(records), len(records))
+    parts = [_photo(panels[0], photo, _whole(camera), "photo-0", theme)]
+    for panel, record in zip(panels, records, strict=True):
         in_front = np.isfinite(record.reprojected[:, 0])
         ahead = np.flatnonzero(in_front)
         ahead = ahead[evenly(len(ahead), max_points)]
-        observed = record.pixels[ahead]
-        ends = observed + scale * (record.reprojected[ahead] - observed)
-        axes.add_collection(
-            LineCollection(
-                list(np.stack([observed, ends], axis=1)), colors=theme.second, linewidths=0.9, gid="error-vectors"
-            )
+        observed, reprojected = panel.place(record.pixels[ahead]), panel.place(record.reprojected[ahead])
+        vectors = scale * (reprojected - observed)
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+        ends = observed + vectors * np.minimum(1.0, LONGEST_VECTOR / np.maximum(length, 1e-9))
+        inside = (
+            svg.used("photo-0", _corner(panel, _whole(camera))),
+            svg.segments(np.stack([observed, ends], axis=1), theme.second, 1.2, "error-vectors"),
+            svg.crosses(observed, theme.first, 4.6, 1.1, "observed"),
+            svg.dots(ends, theme.second, 3.4, "reprojected"),
+            svg.squares(panel.place(record.pixels[~in_front]), theme.bad, 5.5, 1.2, "behind"),
         )
-        axes.scatter(*observed.T, s=13, marker="x", c=theme.first, linewidths=0.8, zorder=3, gid="observed")
-        axes.scatter(*ends.T, s=5, c=theme.second, linewidths=0, zorder=4, gid="reprojected")
-        behind = record.pixels[~in_front]
-        axes.scatter(*behind.T, s=16, marker="s", facecolors="none", edgecolors=theme.bad, linewidths=0.9, gid="behind")
-        row = record.as_row()
-        mean = "no point in front" if row["mean_px"] is None else f"mean {row['mean_px']:.2f} px"
-        unseen = f", {row['behind']} behind" if row["behind"] else ""
-        magnified = f", vectors ×{scale}" if len(records) < 3 or axes is panels[0] else ""
-        size = 10.0 if len(records) < 3 else 8.5
-        set_title(axes, f"{record.stage}: {mean}, {row['points']} points{unseen}{magnified}", theme, size=size)
-    return figure
+        magnified = f", vectors ×{scale}" if len(records) < 3 or panel is panels[0] else ""
+        size = svg.TITLE_SIZE if len(records) < 3 else 12.0
+        parts += [title(panel, _stage_title(record) + magnified, theme, size=size), panel.clipped(inside)]
+    return svg.page(WIDTH, height, theme, parts)
+
+
+def _stage_title(record: StageRecord) -> str:
+    row = record.as_row()
+    mean = "no point in front" if row["mean_px"] is None else f"mean {row['mean_px']:.2f} px"
+    unseen = f", {row['behind']} behind" if row["behind"] else ""
+    return f"{record.stage}: {mean}, {row['points']} points{unseen}"
 
 
 def magnification(records: Sequence[StageRecord], width_px: int) -> int:
@@ -214,66 +220,72 @@ def epipole(E: Float[np.ndarray, "3 3"], camera2: Camera) -> Float[np.ndarray, "
     return camera2.calibration_matrix() @ left_null
 
 
-def _mark_epipole(axes: Axes, point: Float[np.ndarray, "3"], camera: Camera, theme: Theme) -> None:
+def _epipole_mark(panel: Panel, point: Float[np.ndarray, "3"], camera: Camera, theme: Theme) -> str:
     """A star at the epipole, or an arrow at the border towards it."""
     size = np.array([camera.width, camera.height])
-    outline = [Stroke(linewidth=2.5, foreground=theme.paper), Normal()]
-    style = {"color": theme.ink, "fontsize": 8.5, "family": FONT, "path_effects": outline}
     is_finite = abs(point[2]) > 1e-9 * np.linalg.norm(point)
     pixel = point[:2] / point[2] if is_finite else np.full(2, np.inf)
     if np.all((pixel >= 0) & (pixel <= size)):
-        uv = (pixel - camera.principal_point) / camera.focal
-        x, y = image_from_plane(camera, uv[None])[0]
-        axes.scatter([x], [y], s=110, marker="*", c=theme.ink, edgecolors="black", zorder=5, gid="epipole")
-        axes.annotate("epipole", (x, y), xytext=(8, 4), textcoords="offset points", zorder=5, **style)
-        return
+        x, y = panel.place(image_from_plane(camera, ((pixel - camera.principal_point) / camera.focal)[None])[0])
+        angle = np.arange(10) * np.pi / 5
+        tips = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * np.where(np.arange(10) % 2, 3.2, 8.0)[:, None]
+        star = svg.polygon(tips + [x, y], theme.ink, "epipole", outline="black")
+        return star + svg.text((x + 11, y - 6), "epipole", theme.ink, size=11.5, halo=theme.paper)
     direction = pixel - size / 2 if is_finite else point[:2]
     direction = direction / np.linalg.norm(direction)
-    reach = np.min((size / 2 * 0.97) / np.maximum(np.abs(direction), 1e-9))
-    tip, tail = size / 2 + reach * direction, size / 2 + (reach - 0.09 * camera.width) * direction
-    arrow = {"arrowstyle": "-|>", "color": theme.ink, "linewidth": 1.6}
-    axes.annotate("", tuple(tip), xytext=tuple(tail), arrowprops=arrow, zorder=5, gid="epipole")
-    axes.annotate(
-        "to the epipole", tuple(tail), xytext=(-6 * direction[0], 9 + 9 * abs(direction[1])),
-        textcoords="offset points", ha="right" if direction[0] > 0 else "left", zorder=5, **style,
-    )  # fmt: skip
+    half = np.array([panel.width, panel.height]) / 2
+    center = np.array([panel.left, panel.top]) + half
+    tip = center + np.min(half * 0.97 / np.maximum(np.abs(direction), 1e-9)) * direction
+    tail = tip - 0.09 * panel.width * direction
+    at = (
+        tail[0] - 8 * direction[0],
+        tail[1] - 12 - 12 * abs(direction[1]) if tail[1] > center[1] - 0.7 * half[1] else tail[1] + 20,
+    )
+    words = svg.text(
+        at, "to the epipole", theme.ink, size=11.5, anchor="end" if direction[0] > 0 else "start", halo=theme.paper
+    )
+    return svg.arrow(tail, tip, theme.ink, 2.0, "epipole") + words
 
 
-def _panels(sizes: Sequence[tuple[float, float]], columns: int, theme: Theme) -> tuple[Figure, list[Axes]]:
-    """Axes in rows of `columns`, each as wide as the others and as tall as its size asks, with room for a title."""
-    title_in, gap_in, margin_in = 0.34, 0.12, 0.12
-    width = (WIDTH_IN - 2 * margin_in - (columns - 1) * gap_in) / columns
-    rows = [sizes[k : k + columns] for k in range(0, len(sizes), columns)]
-    heights = [max(width * h / w for w, h in row) for row in rows]
-    total = sum(heights) + len(rows) * title_in + margin_in + (len(rows) - 1) * gap_in
-    figure = new_figure(WIDTH_IN, total, theme, dpi=PHOTO_DPI)
-    panels, top = [], total
-    for row, height in zip(rows, heights, strict=True):
-        top -= title_in
+def _panels(sizes: Sequence[tuple[float, float]], columns: int) -> tuple[float, list[Panel]]:
+    """Height of the figure, and rows of `columns` panels, equally wide, as tall as their sizes ask, room for titles.
+
+    A panel's values are the pixels of its size, y down.
+    """
+    width = (WIDTH - 2 * MARGIN - (columns - 1) * GAP) / columns
+    panels, top = [], 0.0
+    for first in range(0, len(sizes), columns):
+        row = sizes[first : first + columns]
+        top += TITLE if not first else TITLE + GAP
         for k, (w, h) in enumerate(row):
-            left, own = margin_in + k * (width + gap_in), width * h / w
-            axes = figure.add_axes((left / WIDTH_IN, (top - own) / total, width / WIDTH_IN, own / total))
-            axes.set(xlim=(0, w), ylim=(h, 0))
-            axes.set_axis_off()
-            panels.append(axes)
-        top -= height + gap_in
-    return figure, panels
+            panels.append(Panel(MARGIN + k * (width + GAP), top, width, width * h / w, x=(0.0, w), y=(h, 0.0)))
+        top += max(width * h / w for w, h in row)
+    return top + MARGIN, panels
 
 
-def _show_photo(axes: Axes, photo: MaybePhoto, extent: tuple[float, float, float, float], theme: Theme) -> None:
-    """The photo, dimmed so that what is drawn on it stands out."""
-    limits = axes.get_xlim(), axes.get_ylim()
+def _photo(panel: Panel, photo: MaybePhoto, extent: Extent, key: str, theme: Theme) -> str:
+    """A photo, dim so that what is drawn on it stands out, or a plain box where there is none; to be used by key."""
+    (left, top), (right, bottom) = _placed_extent(panel, extent)
+    box = (0.0, 0.0, right - left, bottom - top)
     if photo is None:
-        x, width, height, y = extent[0], extent[1] - extent[0], extent[2] - extent[3], extent[3]
-        axes.add_patch(Rectangle((x, y), width, height, facecolor=theme.grid, edgecolor="none"))
-    else:
-        dimmed = (small(photo, DRAWN_PX) * np.float32(0.6)).astype(np.uint8)
-        axes.imshow(dimmed, extent=extent, interpolation="antialiased", aspect="auto", zorder=0)
-    axes.set(xlim=limits[0], ylim=limits[1])
+        return svg.defined(svg.rectangle(box, theme.grid, "photo"), key)
+    encoded = raster.encode_jpeg(raster.dimmed(raster.small(photo, raster.DRAWN_PX)))
+    return svg.defined(svg.picture(encoded, box, "photo"), key)
 
 
-def _whole(camera: Camera) -> tuple[float, float, float, float]:
-    """(left, right, bottom, top) of a photo by itself."""
+def _corner(panel: Panel, extent: Extent) -> tuple[float, float]:
+    (left, top), _ = _placed_extent(panel, extent)
+    return left, top
+
+
+def _placed_extent(panel: Panel, extent: Extent) -> list[list[float]]:
+    """Left upper and right lower corner on the page."""
+    left, right, bottom, top = extent
+    return panel.place(np.array([[left, top], [right, bottom]])).tolist()
+
+
+def _whole(camera: Camera) -> Extent:
+    """Of a photo by itself."""
     return 0.0, float(camera.width), float(camera.height), 0.0
 
 
@@ -287,8 +299,8 @@ def _side_by_side(cameras: tuple[Camera, Camera]) -> tuple[float, float]:
     return right, height
 
 
-def _extent(cameras: tuple[Camera, Camera], side: int) -> tuple[float, float, float, float]:
-    """(left, right, bottom, top) of a photo on the common canvas."""
+def _extent(cameras: tuple[Camera, Camera], side: int) -> Extent:
+    """Of a photo on the common canvas."""
     height = float(max(c.height for c in cameras))
     widths = [c.width * height / c.height for c in cameras]
     left = 0.0 if side == 0 else widths[0] + GAP_PX_SHARE * sum(widths)
@@ -299,12 +311,6 @@ def _placed(pixels: Float[np.ndarray, "n 2"], cameras: tuple[Camera, Camera], si
     """Pixels of a photo on the common canvas."""
     left, _, height, _ = _extent(cameras, side)
     return pixels * (height / cameras[side].height) + np.array([left, 0.0])
-
-
-def _add_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], color: str, gid: str) -> None:
-    axes.add_collection(LineCollection(list(segments), colors=color, linewidths=0.8, alpha=0.75, gid=gid))
-    ends = segments.reshape(-1, 2)
-    axes.scatter(*ends.T, s=5, c=color, linewidths=0, zorder=3)
 
 
 def _inlier_mask(graph: MatchGraph, pair: ImagePair) -> np.ndarray:

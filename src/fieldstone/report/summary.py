@@ -39,7 +39,7 @@ SECTIONS = (
 
 FIGURES_IN_SIGHT = 2
 """Photo figures of one kind beyond these are folded."""
-MIME = {".png": "image/png", ".jpg": "image/jpeg"}
+MIME = {".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 
 
 @dataclass(frozen=True)
