@@ -153,6 +153,16 @@ def test_photos_that_see_nothing_are_refused():
         training(executor, images=images)
 
 
+@pytest.mark.parametrize(("finest", "min_weight"), [(32, 8e-3), (384, 8e-3), (384, 3e-2)])
+def test_the_fog_of_the_start_is_seen(finest, min_weight):
+    """However short the steps of a grid are, its first samples weigh enough to be learned from."""
+    plan = replace(PLAN, finest=finest, min_weight=min_weight)
+    with ThreadPoolExecutor(1) as executor:
+        state = training(executor, plan).start()
+    march = state.field.march(plan.min_weight, plan.min_light)
+    assert -np.expm1(-np.exp(march.raw_offset) * march.depth_scale) > 1.5 * min_weight
+
+
 def test_scouting_finds_the_box_around_the_ball():
     """Without alpha the box of the start is that of the frame; after one stage it is little more than the ball."""
     plan = replace(PLAN, finest=64, steps=(120, 3, 1, 1, 1, 1, 1, 1))

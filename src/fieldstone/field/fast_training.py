@@ -19,6 +19,7 @@ from fieldstone.errors import InputError
 from fieldstone.field.fast_decoder import HIDDEN, Decoder, decoder_width, initial_decoder
 from fieldstone.field.fast_field import (
     FOREVER,
+    REFERENCE_CELLS,
     FastField,
     compress,
     expand,
@@ -48,6 +49,9 @@ CELL_VERTICES = 2
 
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
+
+START_WEIGHTS = 2.0
+"""The fog of the start weighs at least this many times `FastPlan.min_weight` in every sample."""
 
 MIN_STEPS = 60
 """No cell is given up before so many steps."""
@@ -109,7 +113,9 @@ class FastTraining:
             vertices = layout.level(table, level)
             vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
         near = NEAR_SHARE * self.frame.near if self.unbounded else 0.0
-        offset, step = plan.raw_offset, plan.step_cells
+        # Fog that a step takes for empty teaches nothing: a fine grid, whose steps are short, has to start denser.
+        visible = START_WEIGHTS * plan.min_weight / (plan.step_cells * REFERENCE_CELLS / layout.resolutions[-1])
+        offset, step = max(plan.raw_offset, math.log(visible)), plan.step_cells
         field = FastField(layout, table, decoder, occupancy, offset, step, self.unbounded, near, self.projection)
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
         rays = np.full(plan.num_chunks, plan.samples_per_chunk // 8, dtype=np.int64)
