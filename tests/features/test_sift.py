@@ -127,3 +127,18 @@ def test_options_refuse_nonsense():
     ):
         with pytest.raises(ValueError):
             wrong()
+
+
+def test_features_under_a_mask_leave_their_room_to_others():
+    image = texture(0, 300, 200)
+    keep = np.zeros((200, 300), dtype=bool)
+    keep[:, :100] = True
+    everything = Sift(SiftOptions(max_features=10**6))(image)
+    inside = everything[everything.keypoints[:, 0] < 100.0]
+    masked = Sift(SiftOptions(max_features=10**6))(image, keep)
+    np.testing.assert_array_equal(masked.keypoints, inside.keypoints)
+    np.testing.assert_array_equal(masked.descriptors, inside.descriptors)
+    few = Sift(SiftOptions(max_features=50))(image, keep)
+    assert len(inside) > 50
+    assert len(few) == 50
+    assert len(Sift()(image, np.zeros_like(keep))) == 0

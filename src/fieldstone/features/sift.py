@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from fieldstone.scene.features import Features
 
@@ -52,8 +52,12 @@ class Sift:
 
     options: SiftOptions = field(default_factory=SiftOptions)
 
-    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
-        """Features of an sRGB photo; keypoints and scales in pixels of the photo as given, corner convention."""
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], keep: Bool[np.ndarray, "h w"] | None = None) -> Features:
+        """Features of an sRGB photo; keypoints and scales in pixels of the photo as given, corner convention.
+
+        Args:
+            keep: Features whose centre lies elsewhere are left out before the strongest are chosen; None: none is.
+        """
         reduced = reduce_to(image, self.options.max_image_size)
         grey = cv2.cvtColor(reduced, cv2.COLOR_RGB2GRAY)
         detector = cv2.SIFT.create(
@@ -66,6 +70,8 @@ class Sift:
             # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
             enable_precise_upscale=True,
         )
+        # Each axis of the photo was reduced by its own, rounded, factor.
+        zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
         found = detector.detect(grey, None)
         if not found:
             return _no_features()
@@ -75,21 +81,22 @@ class Sift:
         angle = np.deg2rad(np.array([k.angle for k in found], dtype=np.float64))
         response = np.array([k.response for k in found], dtype=np.float64)
 
-        chosen = spread(xy, response, grey.shape, self.options)
+        allowed = np.arange(len(xy)) if keep is None else np.flatnonzero(at_pixels(keep, xy * zoom))
+        if not len(allowed):
+            return _no_features()
+        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, self.options)]
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
         # Only these are described: a second pyramid costs less than thousands of descriptors that nobody needs.
         kept, descriptors = detector.compute(grey, [found[k] for k in order])
         assert descriptors is not None
         assert len(kept) == len(order)
-        # Each axis of the photo was reduced by its own, rounded, factor.
-        zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
         pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
         return Features(
             keypoints=pixels,
             scale=radius[order] * float(np.sqrt(zoom.prod())),
             angle=angle[order],
             descriptors=root_sift(np.asarray(descriptors, dtype=np.uint8)),
-            colors=colors_at(image, pixels),
+            colors=at_pixels(image, pixels),
         )
 
 
@@ -133,8 +140,8 @@ def root_sift(descriptors: UInt8[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 1
     return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(shares)), 255.0).astype(np.uint8)
 
 
-def colors_at(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colour of the pixel in which each position lies."""
+def at_pixels(image: Shaped[np.ndarray, "h w *c"], pixels: Float[np.ndarray, "n 2"]) -> Shaped[np.ndarray, "n *c"]:
+    """Value of the pixel in which each position lies."""
     column = np.clip(pixels[:, 0].astype(np.int64), 0, image.shape[1] - 1)
     row = np.clip(pixels[:, 1].astype(np.int64), 0, image.shape[0] - 1)
     return image[row, column]

@@ -116,8 +116,14 @@ def list_photos(folder: Path) -> list[Path]:
         logger.warning("%s: %d files cannot be read, convert them to JPEG: %s", folder, len(unreadable), unreadable[:5])
     if not photos:
         reason = "only formats that cannot be read; convert them to JPEG" if unreadable else "no photo"
-        raise InputError(f"{folder}: {reason} (read: {', '.join(PHOTO_SUFFIXES)})")
+        below = sorted(p.name for p in folder.iterdir() if p.is_dir() and _has_photos(p))
+        where = f"; there are some in {below[0]}/, give that folder" if below else ""
+        raise InputError(f"{folder}: {reason}{where} (read: {', '.join(PHOTO_SUFFIXES)})")
     return sorted(photos, key=lambda p: natural_key(p.name))
+
+
+def _has_photos(folder: Path) -> bool:
+    return any(p.suffix.lower() in PHOTO_SUFFIXES for p in folder.iterdir())
 
 
 def read_photo_info(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> PhotoInfo:
@@ -174,6 +180,13 @@ def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 9
     """Write RGB or RGBA pixels, format by suffix, whole or not at all; `quality` is for JPEG and WebP."""
     with replacing(path) as temporary:
         Image.fromarray(rgb).save(temporary, quality=quality)
+
+
+def turned_upright(pixels: UInt8[np.ndarray, "h w"], orientation: int) -> UInt8[np.ndarray, "_ _"]:
+    """Stored pixels turned as EXIF says, see `UPRIGHT`."""
+    if orientation not in UPRIGHT:
+        return pixels
+    return np.asarray(Image.fromarray(pixels).transpose(UPRIGHT[orientation]))
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -98,6 +99,14 @@ def key_of(*parts: Any) -> str:
             digest.update(json.dumps(part, sort_keys=True, default=_plain).encode())
         digest.update(b"\0")
     return digest.hexdigest()[:32]
+
+
+@cache
+def code_version() -> str:
+    """Hash of this program's sources: other code may give other results, whatever the version says."""
+    package = Path(__file__).resolve().parents[1]
+    sources = sorted(package.rglob("*.py"))
+    return key_of(*[[path.relative_to(package).as_posix(), file_hash(path)] for path in sources])
 
 
 def file_hash(path: Path) -> str:

@@ -8,12 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Int
 
-from fieldstone import __version__
 from fieldstone.features.matching import MutualRatio
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.workspace import Packing, Unit, Workspace, key_of, resumed
+from fieldstone.io.workspace import Packing, Unit, Workspace, code_version, key_of, resumed
 from fieldstone.pipeline.detection import SeenPhoto
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
@@ -37,7 +36,7 @@ def match_pairs(
         with ThreadPoolExecutor(options.threads) as pool:
             yield from pool.map(lambda pair: matcher(photos[pair[0]].features, photos[pair[1]].features), some)
 
-    keys = [key_of(__version__, photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
+    keys = [key_of(code_version(), photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
     packing = Packing(lambda rows: Unit({"rows": rows}), lambda unit: unit.arrays["rows"])
     matches = resumed(workspace, "matches", keys, pairs, work, packing)
     return MatchGraph(
@@ -66,7 +65,7 @@ def verify(
     def key(pair: ImagePair) -> str:
         used = [cameras[camera_of_image[k]] for k in pair]
         return key_of(
-            __version__, [photos[k].key for k in pair], options.max_ratio, used, options.two_view, [seed, *pair]
+            code_version(), [photos[k].key for k in pair], options.max_ratio, used, options.two_view, [seed, *pair]
         )
 
     packing = Packing(_pack, _unpack)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from fieldstone.features.pairs import PairOptions
 from fieldstone.features.sift import SiftOptions
@@ -28,5 +29,7 @@ class MatchingOptions:
     """Given intrinsics are exact."""
     single_camera: bool = False
     """All photos share one camera, whatever their EXIF says."""
+    masks: Path | None = None
+    """Folder with masks of the photos, see `io.masks`; no features where they are black."""
     threads: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Results are the same for any number."""
