@@ -1,15 +1,19 @@
 """Bad photos among good ones, and what is said of them."""
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
+from fieldstone.errors import InputError
 from fieldstone.features.sift import SiftOptions
 from fieldstone.io.workspace import Workspace
+from fieldstone.pipeline.detection import sharpness
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import match_photos
 
@@ -43,3 +47,60 @@ def test_no_features_under_masks(photos, tmp_path):
     changed = match_photos(photos, options, 0, lambda stage: None, workspace).graph
     assert changed.keypoints[3][:, 0].min() >= 200.0
     np.testing.assert_array_equal(changed.keypoints[2], graph.keypoints[2])
+
+
+def test_copies_are_used_once(photos):
+    shutil.copy(photos / "house_02.jpg", photos / "zz.jpg")
+    material = matched(photos)
+    assert len(material.graph.names) == 6
+    (problem,) = material.problems
+    assert (problem.path.name, problem.kind) == ("zz.jpg", "not used")
+    assert problem.reason == "duplicate of house_02.jpg, byte for byte"
+
+
+def test_one_photo_many_times_is_one_clear_error(photos):
+    for path in sorted(photos.iterdir())[1:]:
+        shutil.copy(photos / "house_00.jpg", path)
+    with pytest.raises(
+        InputError, match=r"two different readable photos, found 1; house_01.jpg: duplicate of house_00"
+    ):
+        matched(photos)
+
+
+def test_odd_names(photos):
+    names = ["a b.jpg", "häuschen ü.jpg", "new\nline.jpg", "a..b.jpg", "<script>.jpg"]
+    for path, name in zip(sorted(photos.iterdir()), names, strict=False):
+        path.rename(photos / name)
+    shutil.copy(photos / "a b.jpg", os.fsencode(photos / "x.jpg").replace(b"x.jpg", b"\xff.jpg"))
+    material = matched(photos)
+    assert set(material.graph.names) == {"a b.jpg", "häuschen ü.jpg", "a..b.jpg", "<script>.jpg", "house_05.jpg"}
+    assert sorted(p.path.name for p in material.problems) == ["new\nline.jpg", "\udcff.jpg"]
+    assert all("rename it" in p.reason for p in material.problems)
+
+
+def test_bad_files_take_no_good_photo_away(photos, tmp_path):
+    expected = matched(photos).graph
+    data = (photos / "house_01.jpg").read_bytes()
+    (photos / "cut.jpg").write_bytes(data[: len(data) // 2])
+    (photos / "empty.jpg").write_bytes(b"")
+    (photos / "text.jpg").write_text("hello")
+    Image.new("RGB", (1, 1)).save(photos / "tiny.png")
+    Image.new("RGB", (30_000, 20), (90, 120, 40)).save(photos / "wide.jpg")
+    material = matched(photos)
+    assert sorted(p.path.name for p in material.problems) == ["cut.jpg", "empty.jpg", "text.jpg"]
+    graph = material.graph
+    good = [graph.names.index(name) for name in expected.names]
+    for (i, j), two_view in expected.two_views.items():
+        again = graph.two_views[good[i], good[j]]
+        assert again.kind == two_view.kind
+        assert abs(int(again.inliers.sum()) - int(two_view.inliers.sum())) <= 0.1 * len(two_view.inliers)
+
+
+def test_sharpness_falls_with_blur(photos):
+    rgb = np.asarray(Image.open(photos / "house_03.jpg"))
+    values = [
+        sharpness(np.asarray(cv2.GaussianBlur(rgb, (0, 0), s), dtype=np.uint8), 1600) for s in (0.5, 1.0, 2.0, 4.0)
+    ]
+    assert sharpness(rgb, 1600) > values[0]
+    assert values == sorted(values, reverse=True)
+    assert sharpness(np.full_like(rgb, 7), 1600) == 0.0

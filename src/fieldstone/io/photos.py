@@ -93,6 +93,7 @@ class PhotoProblem:
 
     path: Path
     reason: str
+    kind: str = "not readable"
 
 
 def natural_key(name: str) -> tuple:

@@ -8,10 +8,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import cv2
+import numpy as np
+from jaxtyping import UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.features.sift import Sift
+from fieldstone.features.sift import Sift, reduce_to
 from fieldstone.io.masks import check_polarity, find_masks, read_mask
+from fieldstone.io.names import name_problem
 from fieldstone.io.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
 from fieldstone.io.workspace import Unit, Workspace, code_version, file_hash, key_of
 from fieldstone.pipeline.matching_options import MatchingOptions
@@ -30,13 +33,16 @@ class SeenPhoto:
     """Hash of what the features depend on."""
     kept: float = 1.0
     """Share of the pixels that the mask keeps."""
+    sharpness: float = 1.0
+    """See `sharpness`."""
 
 
 def detect(
     paths: Sequence[Path], options: MatchingOptions, workspace: Workspace
 ) -> tuple[list[SeenPhoto], list[PhotoProblem]]:
-    """Features of every readable photo, in the order of the paths, and the files that are none.
+    """Features of every readable photo, in the order of the paths, and the files that are not used.
 
+    Of several photos with the same content only the first is used: the others would count its observations twice.
     Decoding and extraction release the interpreter lock. A photo is let go as soon as its features are known.
 
     Raises:
@@ -47,24 +53,48 @@ def detect(
 
     def one(path: Path) -> SeenPhoto | PhotoProblem:
         mask = masks.get(path)
+        bad_name = name_problem(path.name)
+        if bad_name is not None:
+            return PhotoProblem(path, f"{bad_name}; rename it", "not used")
         try:
             hashes = [file_hash(path), None if mask is None else file_hash(mask)]
             key = key_of(STAGE, code_version(), cv2.__version__, hashes, options.sift)
             unit = workspace.find(STAGE, key)
             if unit is not None:
-                return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, unit.facts["kept"])
+                return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, **unit.facts)
             photo = read_photo(path)
         except InputError as error:
             return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
         keep = None if mask is None else read_mask(mask, photo.info)
-        features, kept = extractor(photo.rgb, keep), 1.0 if keep is None else float(keep.mean())
+        features = extractor(photo.rgb, keep)
+        kept = 1.0 if keep is None else float(keep.mean())
+        facts = {"kept": kept, "sharpness": sharpness(photo.rgb, options.sift.max_image_size)}
         arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
-        workspace.keep(STAGE, key, Unit(arrays, {"kept": kept}))
-        return SeenPhoto(photo.info, features, key, kept)
+        workspace.keep(STAGE, key, Unit(arrays, facts))
+        return SeenPhoto(photo.info, features, key, **facts)
 
     with ThreadPoolExecutor(options.threads) as pool:
         results = list(pool.map(one, paths))
-    seen = [result for result in results if isinstance(result, SeenPhoto)]
+    problems = [result for result in results if isinstance(result, PhotoProblem)]
+    first: dict[str, SeenPhoto] = {}
+    for photo in (result for result in results if isinstance(result, SeenPhoto)):
+        if photo.key in first:
+            reason = f"duplicate of {first[photo.key].info.path.name}, byte for byte"
+            problems.append(PhotoProblem(photo.info.path, reason, "not used"))
+        else:
+            first[photo.key] = photo
+    seen = list(first.values())
     workspace.forget_others(STAGE, [photo.key for photo in seen])
     check_polarity([photo.kept for photo in seen if photo.info.path in masks])
-    return seen, [result for result in results if isinstance(result, PhotoProblem)]
+    return seen, problems
+
+
+def sharpness(rgb: UInt8[np.ndarray, "h w 3"], max_image_size: int) -> float:
+    """How strong the finest detail of a photo is, relative to its contrast: 0 for none.
+
+    The root mean square of the Laplacian over the standard deviation of the grey levels. It compares photos of one
+    scene; there is no value that is sharp for all.
+    """
+    grey = cv2.cvtColor(reduce_to(rgb, max_image_size), cv2.COLOR_RGB2GRAY)
+    contrast = float(grey.std())
+    return float(cv2.Laplacian(grey, cv2.CV_32F).std()) / contrast if contrast > 0.0 else 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -54,6 +54,8 @@ class Material:
     """(width, height) of the photo behind each camera."""
     second_look: tuple[MoreMatches, ...] = ()
     """Ways to find more matches for photos that no model takes in."""
+    sharpness: Mapping[str, float] = field(default_factory=dict)
+    """Of photos by name, see `detection.sharpness`."""
 
     def full_size(self, model: Reconstruction) -> Reconstruction:
         """A reconstruction in working pixels, in the pixels of the photos."""
@@ -96,11 +98,12 @@ def match_photos(
     stop, seconds = _stopwatch()
     photos, problems = detect(list_photos(folder), options, workspace)
     for problem in problems:
-        logger.warning("skipped %s: %s", problem.path.name, problem.reason)
+        logger.warning("skipped %r: %s", problem.path.name, problem.reason)
     if len(photos) < 2:
         reasons = "".join(f"; {problem.path.name}: {problem.reason}" for problem in problems[:3])
         raise InputError(
-            f"{folder}: a reconstruction needs at least two readable photos, found {len(photos)}{reasons}; add photos"
+            f"{folder}: a reconstruction needs at least two different readable photos, found {len(photos)}{reasons}; "
+            "add photos"
         )
     infos, features = [photo.info for photo in photos], [photo.features for photo in photos]
     stop("features")
@@ -128,7 +131,8 @@ def match_photos(
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
     attempts = SecondLook(photos, camera_of_image, options, seed).attempts()
-    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts)
+    sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
+    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts, sharpness)
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
