@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.ExifTags import IFD
 
 from fieldstone.errors import InputError
 from fieldstone.features.sift import SiftOptions
+from fieldstone.io.exif import FOCAL_LENGTH_35MM
 from fieldstone.io.workspace import Workspace
 from fieldstone.pipeline.detection import sharpness
 from fieldstone.pipeline.matching_options import MatchingOptions
@@ -104,3 +106,34 @@ def test_sharpness_falls_with_blur(photos):
     assert sharpness(rgb, 1600) > values[0]
     assert values == sorted(values, reverse=True)
     assert sharpness(np.full_like(rgb, 7), 1600) == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.25, 10.0])
+def test_a_wrong_focal_length_in_exif_is_noticed(photos, factor, caplog):
+    """The cameras were given 29 mm; the vote is good to a few percent on photos of this size."""
+    truth = matched(photos).cameras[0].params[0]
+    rewrite_focal(photos, 29 * factor)
+    material = matched(photos)
+    (note,) = material.notes
+    assert "EXIF is not used" in note
+    assert note in caplog.text
+    assert material.cameras[0].params[0] == pytest.approx(truth, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_exif_that_is_a_little_off_is_believed(photos, factor):
+    rewrite_focal(photos, 29 * factor)
+    material = matched(photos)
+    assert not material.notes
+    stated = round(29 * factor) / np.hypot(36.0, 24.0) * np.hypot(320, 240)
+    assert material.cameras[0].params[0] == pytest.approx(stated, rel=1e-9)
+
+
+def rewrite_focal(photos: Path, focal_35mm: float) -> None:
+    """Write the photos anew with another focal length in EXIF."""
+    for path in photos.iterdir():
+        with Image.open(path) as image:
+            exif = image.getexif()
+            exif.get_ifd(IFD.Exif)[FOCAL_LENGTH_35MM] = round(focal_35mm)
+            image.load()
+            image.save(path, exif=exif, quality=95)

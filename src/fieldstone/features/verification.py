@@ -56,15 +56,21 @@ def two_views_of_pairs(
 
 
 def calibrate_from_pairs(
-    graph: MatchGraph, camera: Camera, images: Bool[np.ndarray, "n"], options: TwoViewOptions, seed: int, threads: int
+    graph: MatchGraph,
+    camera: Camera,
+    images: Bool[np.ndarray, "n"],
+    options: TwoViewOptions,
+    seed: int,
+    threads: int,
+    max_pairs: int = MAX_VOTING_PAIRS,
 ) -> FocalVote | None:
-    """A vote on the unknown focal length that some photos share, over the pairs among them.
+    """A vote on the unknown focal length that some photos share, over those pairs among them with most matches.
 
     Returns:
         The focal length over the longer side of the photo; None if no pair has a fundamental matrix.
     """
     pairs = [pair for pair in sorted(graph.matches) if images[pair[0]] and images[pair[1]]]
-    pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:MAX_VOTING_PAIRS]
+    pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:max_pairs]
     unit, (cx, cy) = float(max(camera.width, camera.height)), camera.principal_point
     pixels_from_unit = np.array([[unit, 0.0, cx], [0.0, unit, cy], [0.0, 0.0, 1.0]])
     uncalibrated = replace(options, focal_known=False)

@@ -22,7 +22,7 @@ from fieldstone.mapping.rescue import MoreMatches
 from fieldstone.pipeline.detection import detect
 from fieldstone.pipeline.matched_pairs import match_pairs, verify
 from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_unknown
+from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
 from fieldstone.pipeline.second_look import SecondLook
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
@@ -56,6 +56,8 @@ class Material:
     """Ways to find more matches for photos that no model takes in."""
     sharpness: Mapping[str, float] = field(default_factory=dict)
     """Of photos by name, see `detection.sharpness`."""
+    notes: Sequence[str] = ()
+    """What a user should know of how the cameras were found."""
 
     def full_size(self, model: Reconstruction) -> Reconstruction:
         """A reconstruction in working pixels, in the pixels of the photos."""
@@ -125,14 +127,16 @@ def match_photos(
     graph = match_pairs(photos, keypoints, pairs, options, workspace)
     stop("matching")
     on_stage("verifying pairs")
-    working = vote_on_unknown(graph, working, camera_of_image, source, options, seed)
+    working, notes = vote_on_focal(graph, working, camera_of_image, source, options, seed)
     graph = verify(graph, photos, working, camera_of_image, options, seed, workspace)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
     attempts = SecondLook(photos, camera_of_image, options, seed).attempts()
     sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
-    return Material(graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts, sharpness)
+    return Material(
+        graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts, sharpness, notes
+    )
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.features.verification import calibrate_from_pairs
+from fieldstone.features.verification import MAX_VOTING_PAIRS, calibrate_from_pairs
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.photos import PhotoInfo
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.solve.focal_voting import FocalVote
 
 logger = logging.getLogger(__name__)
 
@@ -23,6 +24,10 @@ GUESSED_FOCAL = 1.2
 EARTH_RADIUS_M = 6.371e6
 MIN_VOTE_CONTRAST = 0.1
 """A vote on the focal length that is flatter than this says nothing."""
+PAIRS_TO_CHECK_EXIF = 30
+MIN_CONTRAST_AGAINST_EXIF = 0.3
+MAX_EXIF_ERROR = 2.0
+"""EXIF is off by a tenth now and then; off by this factor it belongs to another lens or crop."""
 
 
 def gps_positions(infos: Sequence[PhotoInfo]) -> Float[np.ndarray, "n 3"] | None:
@@ -74,27 +79,57 @@ def cameras_of_photos(
     return tuple(cameras), camera_of_image, source
 
 
-def vote_on_unknown(
+def vote_on_focal(
     graph: MatchGraph,
     cameras: tuple[Camera, ...],
     camera_of_image: Int[np.ndarray, "n"],
     source: list[str],
     options: MatchingOptions,
     seed: int,
-) -> tuple[Camera, ...]:
-    """Cameras without any known focal length get the one that the pairs among their photos vote for."""
-    out = list(cameras)
+) -> tuple[tuple[Camera, ...], list[str]]:
+    """Cameras without a known focal length get the one that the pairs among their photos vote for, and so do those
+    whose EXIF the pairs clearly contradict.
+
+    Returns:
+        The cameras, and one line on every focal length that is not what EXIF says.
+    """
+    out, notes = list(cameras), []
+
+    def vote_of(c: int, max_pairs: int) -> FocalVote | None:
+        images = camera_of_image == c
+        return calibrate_from_pairs(graph, cameras[c], images, options.two_view, seed, options.threads, max_pairs)
+
     for c, camera in enumerate(cameras):
-        if source[c] != "guess":
+        longer = max(camera.width, camera.height)
+        stated = float(camera.params[0]) / longer
+        if source[c] == "guess":
+            vote = vote_of(c, MAX_VOTING_PAIRS)
+            if vote is None or vote.contrast < MIN_VOTE_CONTRAST:
+                notes.append(
+                    f"focal length unknown, and the photos do not tell it: {stated:.2f} times the longer side, guessed"
+                )
+                continue
+        elif source[c] == "exif":
+            vote = vote_of(c, PAIRS_TO_CHECK_EXIF)
+            if vote is None or not contradicts(vote, camera):
+                continue
+            notes.append(
+                f"EXIF states a focal length of {stated:.2f} times the longer side, the photos agree on "
+                f"{vote.ratio:.2f}: EXIF is not used"
+            )
+        else:
             continue
-        vote = calibrate_from_pairs(graph, camera, camera_of_image == c, options.two_view, seed, options.threads)
-        if vote is None or vote.contrast < MIN_VOTE_CONTRAST:
-            logger.warning("focal length unknown, and the photos do not tell it: guessed %.0f px", camera.params[0])
-            continue
-        focal = vote.ratio * max(camera.width, camera.height)
-        logger.info("focal length by vote: %.1f px, contrast %.2f", focal, vote.contrast)
-        out[c] = replace(camera, params=np.array([focal, *camera.principal_point]))
-    return tuple(out)
+        logger.info("focal length by vote: %.1f px, contrast %.2f", vote.ratio * longer, vote.contrast)
+        out[c] = replace(camera, params=np.array([vote.ratio * longer, *camera.principal_point]))
+    for note in notes:
+        logger.warning("%s", note)
+    return tuple(out), notes
+
+
+def contradicts(vote: FocalVote, camera: Camera) -> bool:
+    """Whether a vote is so clear, and so far from the camera's focal length, that the latter must be wrong."""
+    factor = vote.ratio * max(camera.width, camera.height) / float(camera.params[0])
+    return vote.contrast >= MIN_CONTRAST_AGAINST_EXIF and not 1.0 / MAX_EXIF_ERROR < factor < MAX_EXIF_ERROR
 
 
 def _given_camera(options: MatchingOptions, width: int, height: int) -> Camera:
