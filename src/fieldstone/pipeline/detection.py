@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.features.sift import Sift, reduce_to
@@ -35,6 +35,11 @@ class SeenPhoto:
     """Share of the pixels that the mask keeps."""
     sharpness: float = 1.0
     """See `sharpness`."""
+    mask: Path | None = None
+
+    def pixels(self) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+        """The photo, decoded, and which of its pixels are kept; None: all."""
+        return read_photo(self.info.path).rgb, None if self.mask is None else read_mask(self.mask, self.info)
 
 
 def detect(
@@ -61,7 +66,7 @@ def detect(
             key = key_of(STAGE, code_version(), cv2.__version__, hashes, options.sift)
             unit = workspace.find(STAGE, key)
             if unit is not None:
-                return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, **unit.facts)
+                return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, mask=mask, **unit.facts)
             photo = read_photo(path)
         except InputError as error:
             return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
@@ -71,7 +76,7 @@ def detect(
         facts = {"kept": kept, "sharpness": sharpness(photo.rgb, options.sift.max_image_size)}
         arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
         workspace.keep(STAGE, key, Unit(arrays, facts))
-        return SeenPhoto(photo.info, features, key, **facts)
+        return SeenPhoto(photo.info, features, key, mask=mask, **facts)
 
     with ThreadPoolExecutor(options.threads) as pool:
         results = list(pool.map(one, paths))

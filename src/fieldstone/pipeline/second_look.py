@@ -14,7 +14,6 @@ from fieldstone.features.matching import match_mutual
 from fieldstone.features.pairs import preview_counts
 from fieldstone.features.sift import Sift
 from fieldstone.features.verification import two_views_of_pairs
-from fieldstone.io.photos import read_photo
 from fieldstone.mapping.rescue import MoreMatches, Wanted
 from fieldstone.pipeline.detection import SeenPhoto
 from fieldstone.pipeline.matching_options import MatchingOptions
@@ -79,7 +78,7 @@ class SecondLook:
         lost = wanted.lost[:MAX_LOST]
         for v in lost:
             camera, info = wanted.cameras[self.camera_of_image[v]], self.photos[v].info
-            features[v] = richer(read_photo(info.path).rgb)
+            features[v] = richer(*self.photos[v].pixels())
             keypoints[v] = features[v].keypoints * np.array([camera.width / info.width, camera.height / info.height])
             colors[v] = features[v].colors
         graph = replace(
