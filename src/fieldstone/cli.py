@@ -36,6 +36,7 @@ def reconstruct(
     intrinsics: str | None = None,
     fix_intrinsics: bool = False,
     fix_principal_point: bool = False,
+    covariance: bool = False,
     single_camera: bool = False,
     max_image_size: int = 1600,
     threads: int = 0,
@@ -54,6 +55,7 @@ def reconstruct(
         intrinsics: Its parameters in pixels of the stored photo, as fx,fy,cx,cy.
         fix_intrinsics: They are exact: do not refine them.
         fix_principal_point: Hold the principal point.
+        covariance: Also write covariance.safetensors, and the standard deviations of every pose to run.json.
         single_camera: All photos were taken by one camera, whatever their EXIF says.
         max_image_size: Longer side of the photos for finding features, in pixels.
         threads: 0 takes all cores. The result is the same for any number.
@@ -69,7 +71,7 @@ def reconstruct(
         camera_model, intrinsics, fix_intrinsics, single_camera, max_image_size, threads or os.cpu_count() or 1
     )
     calibration = SelfCalibrationOptions(principal_point=not fix_principal_point)
-    incremental = AutomaticOptions(self_calibration=calibration)
+    incremental = AutomaticOptions(self_calibration=calibration, covariance=covariance)
     options = ReconstructOptions(mapper, matching, incremental=incremental, seed=seed, fresh=fresh)
     console = plain_console()
     with console.status("reading") as status:

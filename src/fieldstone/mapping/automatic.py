@@ -21,6 +21,7 @@ from fieldstone.mapping.registration import verdict_of_pairs
 from fieldstone.mapping.rescue import MoreMatches, rescue
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
 from fieldstone.mapping.textbook import four_poses
+from fieldstone.mapping.uncertainty import model_uncertainty
 from fieldstone.mapping.working_model import WorkingModel, record_views, to_reconstruction
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
@@ -41,6 +42,8 @@ class AutomaticOptions:
     self_calibration: SelfCalibrationOptions = field(default_factory=SelfCalibrationOptions)
     min_angle_deg: float = 1.5
     """Points of the result have two rays that meet at this angle at least."""
+    covariance: bool = False
+    """Whether to compute how well poses and points are determined."""
 
     def with_threads(self, threads: int) -> AutomaticOptions:
         """The same with so many threads, which changes nothing but the time."""
@@ -56,6 +59,7 @@ class Finished:
     before: WorkingModel
     drops: list[Drop]
     trials: list[CalibrationTrial]
+    calibration: tuple[CalibrationStep | None, ...]
 
 
 def map_automatic(
@@ -88,6 +92,8 @@ def map_automatic(
     records: list[StageRecord] = record_views(best.before, graph.names, "before BA")
     records += record_views(best.model, graph.names, "after BA")
     start = grown[0].initial_pair
+    refinement = options.incremental.refinement
+    uncertainty = model_uncertainty(best.model, best.calibration, refinement) if options.covariance else None
     initial = four_poses(graph, start, start_cameras, camera_of_image)
     return MappingRun(
         to_reconstruction(best.model, graph),
@@ -99,6 +105,7 @@ def map_automatic(
         _verdicts(graph, grown, [f.model for f in finished]),
         tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
         tuple(_describe(trial) for trial in best.trials) + tuple(_describe_camera(c) for c in best.model.cameras),
+        uncertainty,
     )
 
 
@@ -121,8 +128,8 @@ def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generato
     model, more = drop_outliers(model, "last adjustment", incremental.max_error_px, options.min_angle_deg)
     if collapsed(before, model):
         logger.warning("the last adjustment made the model fall apart: it is left as it had grown")
-        return Finished(before, before, [], trials)
-    return Finished(model, before, drops + more, trials)
+        return Finished(before, before, [], trials, grown.calibration)
+    return Finished(model, before, drops + more, trials, calibration)
 
 
 def _verdicts(graph: MatchGraph, grown: list[GrownModel], models: list[WorkingModel]) -> dict[str, str]:

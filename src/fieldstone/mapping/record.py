@@ -74,6 +74,21 @@ class InitialPair:
 
 
 @dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How well poses and points are determined, in the model's frame and unit; nan for photos without a pose."""
+
+    of_views: Float[np.ndarray, "v 6 6"]
+    """Covariances of the right tangent (omega, v) of `cam_from_world`, see `Rigid3.retract`."""
+    of_points: Float[np.ndarray, "p 3 3"]
+    """Covariances, in the order of the reconstruction's points."""
+    sigma_px: float
+    """Standard deviation of an observation per axis, estimated from the errors that are left; working pixels."""
+    rotation_deg: Float[np.ndarray, "v"]
+    """Standard deviations: the root of the summed variances."""
+    center: Float[np.ndarray, "v"]
+
+
+@dataclass(frozen=True, eq=False)
 class MappingRun:
     """A reconstruction and the story of how it came about."""
 
@@ -90,3 +105,5 @@ class MappingRun:
     """Further components, ranked; they share no photo with the reconstruction."""
     notes: tuple[str, ...] = ()
     """Decisions of the mapper that a user should know of, such as the calibration it found."""
+    uncertainty: Uncertainty | None = None
+    """Of the reconstruction, if it was asked for."""

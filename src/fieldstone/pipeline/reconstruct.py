@@ -15,6 +15,7 @@ import numpy as np
 
 from fieldstone import __version__
 from fieldstone.io.atomic import write_json
+from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.colmap import write_colmap
 from fieldstone.io.lock import sole_writer
 from fieldstone.io.matching_txt import is_course_folder
@@ -96,6 +97,7 @@ def _reconstruct(
     on_stage("writing")
     start = time.perf_counter()
     write_models(run, out)
+    write_covariance(run, out)
     photo_of = shrunk(material.photo_of)
     small = thumbnails(run.graph.names, photo_of)
     write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small)
@@ -119,6 +121,16 @@ def write_models(run: MappingRun, out: Path) -> None:
         write_points(run.reconstruction.points, out / "points.ply")
     elif (out / "run.json").exists():
         (out / "points.ply").unlink(missing_ok=True)
+
+
+def write_covariance(run: MappingRun, out: Path) -> None:
+    """`covariance.safetensors`, if it was asked for: `views` (n, 6, 6), `points` (p, 3, 3)."""
+    path = out / "covariance.safetensors"
+    if run.uncertainty is None:
+        path.unlink(missing_ok=True)
+        return
+    facts = {"sigma_px": run.uncertainty.sigma_px, "photos": list(run.graph.names)}
+    write_checkpoint(path, {"views": run.uncertainty.of_views, "points": run.uncertainty.of_points}, facts)
 
 
 def _components_of_earlier_run(out: Path) -> int:
@@ -176,6 +188,10 @@ def run_record(
         }
         for k, view in enumerate(model.views)
     ]
+    if run.uncertainty is not None:
+        for k in model.registered():
+            photos[k]["sd_rotation_deg"] = float(run.uncertainty.rotation_deg[k])
+            photos[k]["sd_center"] = float(run.uncertainty.center[k])
     photos += [
         {
             "name": p.path.name,

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -20,6 +21,8 @@ from fieldstone.errors import InputError
 from fieldstone.io.atomic import write_bytes, write_json, write_text
 from fieldstone.report.raster import encode_jpeg
 from fieldstone.report.theme import DARK, LIGHT, LIGHTBOX, Theme
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 1
 Layout = Literal["wide", "half"]
@@ -82,9 +85,13 @@ def write_figures(
         thumbnails: Small pictures of photos by name; None keeps those that are stored.
 
     Raises:
-        InputError: The folder holds an index that cannot be read, or cannot be made.
+        InputError: The folder cannot be made.
     """
-    before = read_index(folder)
+    try:
+        before = read_index(folder)
+    except InputError as error:  # what a run has found is not lost over figures that can be drawn again
+        logger.warning("%s; its figures are drawn anew", error)
+        before = FigureIndex((), {})
     stored: list[StoredFigure] = []
     for figure in figures:
         stem = f"{part}-{figure.key}"

@@ -1,0 +1,46 @@
+"""How well a finished model is determined: covariances of its poses and points from the last adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.geometry.rotation import skew
+from fieldstone.mapping.calibration import priors
+from fieldstone.mapping.record import Uncertainty
+from fieldstone.mapping.refinement import Calibration, RefinementOptions, bundle_problem
+from fieldstone.mapping.working_model import WorkingModel, reprojections
+from fieldstone.solve.bundle_covariance import bundle_covariance
+
+
+def model_uncertainty(model: WorkingModel, calibration: Calibration, options: RefinementOptions) -> Uncertainty:
+    """The covariances at the minimum that `refine_until_stable` has found, in the gauge of least variance.
+
+    Raises:
+        ValueError: The model has so many photos that the dense inverse would not fit.
+    """
+    problem, registered, _ = bundle_problem(
+        model, model.is_point(), model.registered_mask(), calibration, options.min_views_for_intrinsics
+    )
+    errors = reprojections(model).errors
+    freedoms = 2 * len(errors) - 6 * len(registered) - 3 * len(problem.points) + 7
+    freedoms -= int(sum(mask.sum() for mask in problem.refine))
+    sigma_px = float(np.sqrt(np.sum(errors**2) / max(freedoms, 1)))
+    bundle = replace(options.final, camera_priors=priors(problem.cameras, calibration))
+    found = bundle_covariance(problem, bundle, sigma_px=sigma_px)
+    of_views = np.full((model.num_views, 6, 6), np.nan)
+    of_views[registered] = found.of_views
+    rotation = np.rad2deg(np.sqrt(np.trace(of_views[:, :3, :3], axis1=1, axis2=2)))
+    return Uncertainty(of_views, found.of_points, sigma_px, rotation, _of_centers(model, of_views))
+
+
+def _of_centers(model: WorkingModel, of_views: Float[np.ndarray, "v 6 6"]) -> Float[np.ndarray, "v"]:
+    """Standard deviation of each camera's centre c = -R^T t, which (omega, v) moves by c x omega - v in the world."""
+    out = np.full(len(of_views), np.nan)
+    for v, pose in enumerate(model.poses):
+        if pose is not None:
+            J = np.concatenate([skew(pose.target_origin_in_source()), -np.eye(3)], axis=1)
+            out[v] = np.sqrt(np.trace(J @ of_views[v] @ J.T))
+    return out
