@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.mapping.ambiguity import resolve_ambiguity, with_ambiguity
 from fieldstone.mapping.calibration import CalibrationStep, as_model
 from fieldstone.mapping.global_mapper import map_global
 from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
@@ -78,6 +79,23 @@ def map_automatic(
         known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
         second_look: Ways to find more matches for photos that no model takes in, tried in turn.
     """
+    resolution = resolve_ambiguity(graph, cameras, camera_of_image)
+    if resolution.left_out.any():
+        second_look = ()  # it would find again what was left out
+    run = _map_components(resolution.graph, cameras, camera_of_image, known, options, seed, second_look)
+    return with_ambiguity(run, resolution)
+
+
+def _map_components(
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    known: Bool[np.ndarray, "c"],
+    options: AutomaticOptions,
+    seed: int,
+    second_look: Sequence[MoreMatches],
+) -> MappingRun:
+    """`map_automatic` for a graph whose pairs do not contradict each other."""
     calibration = [None if known[c] else STARTING_STEP for c in range(len(cameras))]
     start_cameras = [camera if known[c] else as_model(camera, STARTING_STEP.model) for c, camera in enumerate(cameras)]
     mapper = map_global if options.mapper == "global" else map_incremental
