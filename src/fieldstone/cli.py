@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -38,6 +39,7 @@ def reconstruct(
     fix_principal_point: bool = False,
     covariance: bool = False,
     single_camera: bool = False,
+    masks: Path | None = None,
     max_image_size: int = 1600,
     threads: int = 0,
     seed: int = 0,
@@ -57,6 +59,7 @@ def reconstruct(
         fix_principal_point: Hold the principal point.
         covariance: Also write covariance.safetensors, and the standard deviations of every pose to run.json.
         single_camera: All photos were taken by one camera, whatever their EXIF says.
+        masks: Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. White is kept.
         max_image_size: Longer side of the photos for finding features, in pixels.
         threads: 0 takes all cores. The result is the same for any number.
         seed: Every random number of the run follows from it.
@@ -70,6 +73,7 @@ def reconstruct(
     matching = _matching_options(
         camera_model, intrinsics, fix_intrinsics, single_camera, max_image_size, threads or os.cpu_count() or 1
     )
+    matching = replace(matching, masks=masks)
     calibration = SelfCalibrationOptions(principal_point=not fix_principal_point)
     incremental = AutomaticOptions(self_calibration=calibration, covariance=covariance)
     options = ReconstructOptions(mapper, matching, incremental=incremental, seed=seed, fresh=fresh)

@@ -1,6 +1,7 @@
 """Bad photos among good ones, and what is said of them."""
 
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from fieldstone.io.workspace import Workspace
 from fieldstone.pipeline.detection import sharpness
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import match_photos
+from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct
 
 OPTIONS = MatchingOptions(sift=SiftOptions(max_features=1000), threads=2)
 
@@ -106,6 +108,19 @@ def test_sharpness_falls_with_blur(photos):
     assert sharpness(rgb, 1600) > values[0]
     assert values == sorted(values, reverse=True)
     assert sharpness(np.full_like(rgb, 7), 1600) == 0.0
+
+
+def test_every_photo_left_out_gets_a_verdict_with_a_number(photos, tmp_path):
+    rgb = np.asarray(Image.open(photos / "house_03.jpg"))
+    Image.fromarray(np.asarray(cv2.GaussianBlur(rgb, (0, 0), 8.0), dtype=np.uint8)).save(photos / "house_03.jpg")
+    Image.fromarray(np.full((240, 320, 3), 90, dtype=np.uint8)).save(photos / "wall.png")
+    shutil.copy(photos / "house_01.jpg", photos / "copy.jpg")
+    record = reconstruct(photos, tmp_path / "out", ReconstructOptions(matching=OPTIONS))
+    verdicts = {photo["name"]: photo["verdict"] for photo in record["photos"] if not photo["registered"]}
+    assert set(verdicts) == {"house_03.jpg", "wall.png", "house_01.jpg"}
+    assert re.search(r"\d+ features; \d+ % as sharp as the median photo", verdicts["house_03.jpg"])
+    assert "0 features" in verdicts["wall.png"]
+    assert verdicts["house_01.jpg"] == "not used: duplicate of copy.jpg, byte for byte"
 
 
 @pytest.mark.parametrize("factor", [0.25, 10.0])

@@ -29,7 +29,7 @@ from fieldstone.pipeline.material import Material, OnStage, match_photos, read_c
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
-from fieldstone.scene.reconstruction import Reconstruction
+from fieldstone.scene.reconstruction import Reconstruction, View
 
 Mapper = Literal["auto", "textbook", "incremental", "global"]
 UNITS = "units"
@@ -183,7 +183,7 @@ def run_record(
         {
             "name": view.name,
             "registered": view.cam_from_world is not None,
-            "verdict": run.verdicts[view.name],
+            "verdict": run.verdicts[view.name] + _sharpness(view, material),
             "points": int(counts[k]),
         }
         for k, view in enumerate(model.views)
@@ -194,9 +194,10 @@ def run_record(
             photos[k]["sd_center"] = float(run.uncertainty.center[k])
     photos += [
         {
-            "name": p.path.name,
+            # Not every file name is text.
+            "name": p.path.name.encode(errors="backslashreplace").decode(),
             "registered": False,
-            "verdict": f"not readable: {p.reason.removeprefix(f'{p.path}: ')}",
+            "verdict": f"{p.kind}: {p.reason}",
             "points": 0,
         }
         for p in material.problems
@@ -213,12 +214,21 @@ def run_record(
         "cameras": [
             {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in model.cameras
         ],
-        "notes": list(run.notes),
+        "notes": [*material.notes, *run.notes],
         "photos": photos,
         "table": [record.as_row() for record in run.records],
         "drops": [asdict(drop) for drop in run.drops],
         "how_errors_are_counted": HOW_ERRORS_ARE_COUNTED,
     }
+
+
+def _sharpness(view: View, material: Material) -> str:
+    """For a photo that was not registered: how sharp it is, compared with the others."""
+    if view.cam_from_world is not None or view.name not in material.sharpness:
+        return ""
+    median = float(np.median(list(material.sharpness.values())))
+    own = material.sharpness[view.name]
+    return f"; {100 * own / median:.0f} % as sharp as the median photo" if median > 0.0 else "; no detail in any photo"
 
 
 def summary(model: Reconstruction, num_photos: int) -> dict[str, Any]:
