@@ -50,7 +50,7 @@ CELL_VERTICES = 2
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
 
-START_WEIGHTS = 2.0
+START_WEIGHTS = 1.2
 """The fog of the start weighs at least this many times `FastPlan.min_weight` in every sample."""
 
 MIN_STEPS = 60
