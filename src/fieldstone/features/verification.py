@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
-from fieldstone.solve.focal_voting import FocalVote, vote_focal
+from fieldstone.solve.focal_voting import FocalVote, vote_focal, vote_focal_of_rotations
 from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
 
 MAX_VOTING_PAIRS = 300
@@ -67,7 +67,7 @@ def calibrate_from_pairs(
     """A vote on the unknown focal length that some photos share, over those pairs among them with most matches.
 
     Returns:
-        The focal length over the longer side of the photo; None if no pair has a fundamental matrix.
+        The focal length over the longer side of the photo; None if the pairs say nothing of it, as those of one plane.
     """
     pairs = [pair for pair in sorted(graph.matches) if images[pair[0]] and images[pair[1]]]
     pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:max_pairs]
@@ -75,16 +75,25 @@ def calibrate_from_pairs(
     pixels_from_unit = np.array([[unit, 0.0, cx], [0.0, unit, cy], [0.0, 0.0, 1.0]])
     uncalibrated = replace(options, focal_known=False)
 
-    def fundamental(pair: ImagePair) -> tuple[Float[np.ndarray, "3 3"], int] | None:
+    def geometry(pair: ImagePair) -> tuple[bool, Float[np.ndarray, "3 3"], float] | None:
+        """Whether the pair has a fundamental matrix rather than a homography, the matrix, its number of inliers."""
         pixels1, pixels2 = graph.matched_pixels(pair)
         rng = np.random.default_rng([seed, *pair])
         found = estimate_two_view(camera, camera, pixels1, pixels2, uncalibrated, rng)
-        if found.kind != "uncalibrated":  # one plane, or no geometry: nothing about the focal length
-            return None
-        return pixels_from_unit.T @ found.matrix @ pixels_from_unit, int(found.inliers.sum())
+        inliers = float(found.inliers.sum())
+        if found.kind == "uncalibrated":
+            return True, pixels_from_unit.T @ found.matrix @ pixels_from_unit, inliers
+        if found.kind in ("planar", "panoramic"):
+            return False, np.linalg.inv(pixels_from_unit) @ found.matrix @ pixels_from_unit, inliers
+        return None
 
     with ThreadPoolExecutor(threads) as pool:
-        found = [result for result in pool.map(fundamental, pairs) if result is not None]
-    if not found:
+        found = [result for result in pool.map(geometry, pairs) if result is not None]
+    parallax, turning = ([(M, n) for is_F, M, n in found if is_F == wanted] for wanted in (True, False))
+    if sum(n for _, n in turning) > sum(n for _, n in parallax):
+        vote = vote_focal_of_rotations(np.array([H for H, _ in turning]), np.array([n for _, n in turning]))
+        if vote is not None:
+            return vote
+    if not parallax:
         return None
-    return vote_focal(np.array([F for F, _ in found]), np.array([float(n) for _, n in found]))
+    return vote_focal(np.array([F for F, _ in parallax]), np.array([n for _, n in parallax]))

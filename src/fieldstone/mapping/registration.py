@@ -108,7 +108,9 @@ def verdict_of_pairs(graph: MatchGraph, view: int) -> str:
     if not partners or max(partners.values()) == 0:
         return f"no photo shares enough of its {features} features"
     best = max(partners, key=lambda name: partners[name])
-    return f"best partner {best} with {partners[best]} matches that agree, of {features} features"
+    kinds = {two_view.kind for pair, two_view in graph.two_views.items() if view in pair and two_view.inliers.any()}
+    turned = ", the camera only turned between its photos: no depth" if kinds == {"panoramic"} else ""
+    return f"best partner {best} with {partners[best]} matches that agree, of {features} features{turned}"
 
 
 def _angles(

@@ -1,18 +1,23 @@
-"""Focal length from fundamental matrices: all pairs vote over a grid of focal lengths.
+"""Focal length from fundamental matrices, or from the homographies of a turning camera: all pairs vote over a grid.
 
 One pair determines a shared focal length badly or, when the optical axes meet, not at all; many pairs together do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from fieldstone.geometry.rotation import nearest_rotation
+
 SMALLEST_RATIO, LARGEST_RATIO, GRID = 0.2, 8.0, 160
 TRUNCATION = 0.2
 """A pair that is further than this from being essential says nothing more: it may be wrong altogether."""
+LARGEST_DEVIATION = 0.02
+"""Homographies that are further than this from rotations, on average, are those of a plane."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +46,33 @@ def vote_focal(fundamentals: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarr
     """
     if not len(fundamentals):
         raise ValueError("a focal length cannot be voted on without pairs")
+    return _lowest(lambda focal: focal_cost(fundamentals, weights, focal))[0]
+
+
+def vote_focal_of_rotations(
+    homographies: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"]
+) -> FocalVote | None:
+    """The focal length f for which K^-1 H K is most nearly a rotation over all pairs; None if none comes near.
+
+    A camera that turns on the spot has no fundamental matrix, and with a wrong focal length its homographies look like
+    those of a plane seen from several places.
+
+    Args:
+        homographies: H of coordinates as in `vote_focal`.
+
+    Source:
+        `hartley2004`, section 19.6.
+    """
+    if not len(homographies):
+        return None
+    vote, cost = _lowest(lambda focal: rotation_cost(homographies, weights, focal))
+    return vote if cost < LARGEST_DEVIATION else None
+
+
+def _lowest(cost_of: Callable[[float], float]) -> tuple[FocalVote, float]:
+    """The vote over the grid, its minimum refined, and the cost there."""
     grid = np.geomspace(SMALLEST_RATIO, LARGEST_RATIO, GRID)
-    cost = np.array([focal_cost(fundamentals, weights, f) for f in grid])
+    cost = np.array([cost_of(float(f)) for f in grid])
     best = int(np.argmin(cost))
     ratio = float(grid[best])
     if 0 < best < GRID - 1:
@@ -50,7 +80,16 @@ def vote_focal(fundamentals: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarr
         curvature = left - 2.0 * middle + right
         if curvature > 0:
             ratio *= float((grid[1] / grid[0]) ** (0.5 * (left - right) / curvature))
-    return FocalVote(ratio, float(1.0 - cost[best] / max(float(np.median(cost)), 1e-300)))
+    return FocalVote(ratio, float(1.0 - cost[best] / max(float(np.median(cost)), 1e-300))), float(cost[best])
+
+
+def rotation_cost(homographies: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"], focal: float) -> float:
+    """Weighted mean of the pairs' truncated distance from being rotations."""
+    scale = np.array([focal, focal, 1.0])
+    M = homographies * scale / scale[:, None]
+    M = M / np.cbrt(np.linalg.det(M))[:, None, None]
+    distance = np.minimum(np.linalg.norm(M - nearest_rotation(M), axis=(1, 2)), TRUNCATION)
+    return float(np.sum(weights * distance) / np.sum(weights))
 
 
 def focal_cost(fundamentals: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"], focal: float) -> float:
