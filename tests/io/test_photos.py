@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from PIL.ExifTags import IFD
 from PIL.TiffImagePlugin import IFDRational
 
 from fieldstone.errors import InputError
+from fieldstone.io import photos as photos_module
 from fieldstone.io.photos import (
     list_photos,
     natural_key,
@@ -150,7 +153,7 @@ def test_folders_without_photos_are_refused(tmp_path, caplog):
         list_photos(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         list_photos(tmp_path / "missing")
-    (tmp_path / "a.heic").write_bytes(b"")
+    (tmp_path / "a.dng").write_bytes(b"")
     with pytest.raises(InputError, match="convert them to JPEG"):
         list_photos(tmp_path)
 
@@ -214,3 +217,25 @@ def test_real_photos_have_their_known_focal_length():
     info = read_photo_info(list_photos(folder)[0])
     # The published model of these photos has f = 2435 px; EXIF rounds to whole millimetres.
     assert info.exif.focal_px == pytest.approx(2435.38, rel=0.1)
+
+
+def test_heic_comes_upright_with_its_exif():
+    """64 x 48 stored, EXIF orientation 6: red grows downwards and green to the left in the upright photo."""
+    path = Path(__file__).parents[1] / "data" / "gradient.heic"
+    photo = read_photo(path)
+    assert photo.rgb.shape == (64, 48, 3)
+    assert (photo.info.width, photo.info.height) == (48, 64)
+    assert photo.info.exif.camera is not None
+    assert "Gradient" in photo.info.exif.camera
+    row, column = np.mgrid[0:64, 0:48]
+    expected = np.stack([4 * row, 5 * (47 - column), np.full_like(row, 128)], axis=-1)
+    assert np.abs(photo.rgb - expected.astype(np.int64)).mean() < 3
+
+
+def test_heic_without_its_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(photos_module, "PHOTO_SUFFIXES", (".jpg",))
+    monkeypatch.setattr(photos_module, "UNREADABLE_SUFFIXES", (".heic",))
+    monkeypatch.setattr(photos_module, "ADVICE", "for HEIC: pip install 'fieldstone[heic]'")
+    (tmp_path / "a.heic").write_bytes(b"")
+    with pytest.raises(InputError, match=r"fieldstone\[heic\]"):
+        list_photos(tmp_path)

@@ -20,12 +20,15 @@ from PIL import Image
 from fieldstone.errors import InputError
 from fieldstone.io.atomic import replacing
 from fieldstone.io.exif import ExifFacts, exif_facts
+from fieldstone.io.heic import HAS_HEIC, HEIC_SUFFIXES, teach_pillow
 
 logger = logging.getLogger(__name__)
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", *(HEIC_SUFFIXES if HAS_HEIC else ()))
+UNREADABLE_SUFFIXES = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+UNREADABLE_SUFFIXES += () if HAS_HEIC else HEIC_SUFFIXES
+ADVICE = "convert them to JPEG" if HAS_HEIC else "convert them to JPEG (for HEIC: pip install 'fieldstone[heic]')"
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", *(("HEIF",) if HAS_HEIC else ()))
 """The only decoders that a photo may reach."""
 MAX_MEGAPIXELS = 250.0
 
@@ -114,9 +117,9 @@ def list_photos(folder: Path) -> list[Path]:
     photos = [p for p in files if p.suffix.lower() in PHOTO_SUFFIXES]
     unreadable = [p.name for p in files if p.suffix.lower() in UNREADABLE_SUFFIXES]
     if unreadable:
-        logger.warning("%s: %d files cannot be read, convert them to JPEG: %s", folder, len(unreadable), unreadable[:5])
+        logger.warning("%s: %d files cannot be read, %s: %s", folder, len(unreadable), ADVICE, unreadable[:5])
     if not photos:
-        reason = "only formats that cannot be read; convert them to JPEG" if unreadable else "no photo"
+        reason = f"only formats that cannot be read; {ADVICE}" if unreadable else "no photo"
         below = sorted(p.name for p in folder.iterdir() if p.is_dir() and _has_photos(p))
         where = f"; there are some in {below[0]}/, give that folder" if below else ""
         raise InputError(f"{folder}: {reason}{where} (read: {', '.join(PHOTO_SUFFIXES)})")
@@ -195,6 +198,8 @@ def _opened(path: Path, max_megapixels: float) -> Iterator[tuple[Image.Image, Ph
     """The image, not yet decoded, and what its header says."""
     if not path.is_file():
         raise InputError(f"{path}: no such photo")
+    if HAS_HEIC and path.suffix.lower() in HEIC_SUFFIXES:
+        teach_pillow()
     with path.open("rb") as file:
         # Pillow's limit on pixels and its warnings about EXIF are process-wide; ours is per call.
         with _pillow_limits, warnings.catch_warnings():
