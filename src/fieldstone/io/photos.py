@@ -198,7 +198,7 @@ def _opened(path: Path, max_megapixels: float) -> Iterator[tuple[Image.Image, Ph
     """The image, not yet decoded, and what its header says."""
     if not path.is_file():
         raise InputError(f"{path}: no such photo")
-    if HAS_HEIC and path.suffix.lower() in HEIC_SUFFIXES:
+    if HAS_HEIC:  # whatever its name: phones and messengers rename
         teach_pillow()
     with path.open("rb") as file:
         # Pillow's limit on pixels and its warnings about EXIF are process-wide; ours is per call.
