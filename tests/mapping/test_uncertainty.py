@@ -57,4 +57,4 @@ def _in_model_unit(length: float, run, scene) -> float:
         for r in (run.reconstruction, scene.truth)
     )
     spread = [np.linalg.norm(c - c.mean(axis=0)) for c in (model, truth)]
-    return length * spread[0] / spread[1]
+    return float(length * spread[0] / spread[1])
