@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import struct
 import threading
@@ -140,14 +141,21 @@ def read_photo_info(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> Ph
         return info
 
 
-def read_photo(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
+def read_photo(path: Path, *, at_least_px: int | None = None, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     """Decode a photo and turn it upright. 16-bit channels keep their upper 8 bits; grey becomes RGB.
+
+    Args:
+        at_least_px: The pixels may be those of a smaller picture, if its longer side has at least so many: a JPEG is
+            decoded at a half, a quarter or an eighth of its size in a fraction of the time.
 
     Raises:
         InputError: Missing, damaged, truncated, of an unknown format, or larger than `max_megapixels`.
     """
     with _opened(path, max_megapixels) as (image, info):
         try:
+            if at_least_px is not None:
+                share = at_least_px / max(image.size)
+                image.draft(None, (math.ceil(share * image.width), math.ceil(share * image.height)))
             image.load()
             image = _eight_bit(image)
             if info.orientation in UPRIGHT:

@@ -9,12 +9,13 @@ Trees are cut where their evidence is no better than that of pairs which contrad
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rotation import log
@@ -222,7 +223,8 @@ def _misses_less(a: Missing, b: Missing) -> bool:
     missing_a, missing_b = a.missing / FEATURES_PER_REGION, b.missing / FEATURES_PER_REGION
     if CLEAR_RATIO * missing_a * b.expected >= missing_b * a.expected:
         return False
-    chance = binom.cdf(np.floor(missing_a), np.ceil(missing_a + missing_b), a.expected / (a.expected + b.expected))
+    together = math.ceil(missing_a + missing_b)
+    chance = bdtr(math.floor(missing_a), together, a.expected / (a.expected + b.expected))
     return bool(chance < SIGNIFICANCE)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -78,7 +79,7 @@ def detect(
         workspace.keep(STAGE, key, Unit(arrays, facts))
         return SeenPhoto(photo.info, features, key, mask=mask, **facts)
 
-    with ThreadPoolExecutor(options.threads) as pool:
+    with one_thread_each(), ThreadPoolExecutor(options.threads) as pool:
         results = list(pool.map(one, paths))
     problems = [result for result in results if isinstance(result, PhotoProblem)]
     first: dict[str, SeenPhoto] = {}
@@ -92,6 +93,17 @@ def detect(
     workspace.forget_others(STAGE, [photo.key for photo in seen])
     check_polarity([photo.kept for photo in seen if photo.info.path in masks])
     return seen, problems
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """OpenCV's own threads would only get in each other's way where every thread has a photo of its own."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def sharpness(rgb: UInt8[np.ndarray, "h w 3"], max_image_size: int) -> float:

@@ -24,6 +24,7 @@ from fieldstone.pipeline.matched_pairs import match_pairs, verify
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
 from fieldstone.pipeline.second_look import SecondLook
+from fieldstone.report.raster import DRAWN_PX
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -31,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 OnStage = Callable[[str], None]
 PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
-"""Decodes the photo of that name; None if there is none."""
+"""Decodes the photo of that name, large enough for figures; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,12 +141,12 @@ def match_photos(
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
-    """Photos by name, decoded when they are asked for; the last few are kept."""
+    """Photos by name, decoded when they are asked for, no finer than figures need; the last few are kept."""
     by_name = {path.name: path for path in paths}
 
     @lru_cache(maxsize=8)
     def photo_of(name: str) -> np.ndarray | None:
-        return read_photo(by_name[name]).rgb if name in by_name else None
+        return read_photo(by_name[name], at_least_px=DRAWN_PX).rgb if name in by_name else None
 
     return photo_of
 

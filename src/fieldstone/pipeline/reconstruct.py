@@ -99,7 +99,7 @@ def _reconstruct(
     write_models(run, out)
     write_covariance(run, out)
     photo_of = shrunk(material.photo_of)
-    small = thumbnails(run.graph.names, photo_of)
+    small = thumbnails(run.graph.names, photo_of, threads=options.matching.threads)
     write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small)
     seconds["writing"] = time.perf_counter() - start
     record = run_record(source, mapper, run, material, options.seed, seconds)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -173,12 +174,23 @@ def shrunk(photo_of: PhotoByName) -> PhotoByName:
 
 
 def thumbnails(
-    names: Sequence[str], photo_of: PhotoByName, options: FigureOptions | None = None, *, longest_px: int = 176
+    names: Sequence[str],
+    photo_of: PhotoByName,
+    options: FigureOptions | None = None,
+    *,
+    longest_px: int = 176,
+    threads: int = 1,
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
     """Small pictures of the first photos, for the verdicts."""
-    options = options or FigureOptions()
-    photos = ((name, photo_of(name)) for name in names[: options.max_thumbnails])
-    return {name: small(photo, longest_px) for name, photo in photos if photo is not None}
+
+    def thumbnail(name: str) -> UInt8[np.ndarray, "_ _ 3"] | None:
+        photo = photo_of(name)
+        return None if photo is None else small(photo, longest_px)
+
+    chosen = names[: (options or FigureOptions()).max_thumbnails]
+    with ThreadPoolExecutor(threads) as pool:
+        pictures = pool.map(thumbnail, chosen)
+        return {name: picture for name, picture in zip(chosen, pictures, strict=True) if picture is not None}
 
 
 def pairs_to_show(graph: MatchGraph, initial: ImagePair | None, at_most: int) -> list[ImagePair]:
