@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera, image_from_cam
+from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.calibration import LADDER, as_model, priors
 from fieldstone.mapping.growth import covering_tracks, retriangulate
 from fieldstone.mapping.self_calibration import _leave_one_out, prediction_errors
 from fieldstone.mapping.working_model import WorkingModel
@@ -149,21 +148,3 @@ def test_predictions_leave_out_exactly_their_target():
     shifted = replace(model.tracks, pixels=model.tracks.pixels + np.eye(len(model.tracks))[rows[0]][:, None] * 30.0)
     worse = prediction_errors(replace(model, tracks=shifted), rows, _leave_one_out(model.tracks.point[rows]))
     assert worse[0] > 10
-
-
-@pytest.mark.parametrize("step", LADDER, ids=lambda step: f"{step.model} {len(step.free)}")
-def test_a_camera_in_a_richer_model_sees_the_same(step):
-    poor = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 322.0, 238.0]))
-    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], size=(50, 3))
-    rich = as_model(poor, step.model)
-    np.testing.assert_array_equal(image_from_cam(rich, points), image_from_cam(poor, points))
-    assert step.mask().sum() == len(step.free)
-    assert {prior.param for prior in priors([rich], [step])} == set(np.flatnonzero(step.mask()).tolist())
-
-
-def test_a_model_that_cannot_express_the_distortion_is_refused():
-    camera = Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, -0.05]))
-    assert as_model(camera, "OPENCV").coefficients.tolist() == [0.1, -0.05, 0, 0]
-    with pytest.raises(ValueError, match="cannot express"):
-        as_model(camera, "SIMPLE_RADIAL")
-    assert "SIMPLE_RADIAL" in CAMERA_MODELS

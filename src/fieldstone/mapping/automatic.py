@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.ambiguity import resolve_ambiguity, with_ambiguity
-from fieldstone.mapping.calibration import CalibrationStep, as_model
+from fieldstone.mapping.calibration import CalibrationStep, growing_step, with_models
 from fieldstone.mapping.global_mapper import map_global
 from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
 from fieldstone.mapping.point_update import drop_outliers
@@ -28,8 +28,6 @@ from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 
 logger = logging.getLogger(__name__)
-
-STARTING_STEP = CalibrationStep("SIMPLE_RADIAL", ("f", "k"))
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,8 @@ def _map_components(
     second_look: Sequence[MoreMatches],
 ) -> MappingRun:
     """`map_automatic` for a graph whose pairs do not contradict each other."""
-    calibration = [None if known[c] else STARTING_STEP for c in range(len(cameras))]
-    start_cameras = [camera if known[c] else as_model(camera, STARTING_STEP.model) for c, camera in enumerate(cameras)]
+    calibration = [None if known[c] else growing_step(camera) for c, camera in enumerate(cameras)]
+    start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
     grown = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed)
     if not grown:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.calibration import CalibrationStep, as_model, priors
+from fieldstone.mapping.calibration import CalibrationStep, priors, with_models
 from fieldstone.mapping.growth import covering_tracks, retriangulate
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.solve.bundle import BundleOptions, bundle_adjust
@@ -109,15 +109,6 @@ def refine_until_stable(
     return model
 
 
-def with_calibration(model: WorkingModel, calibration: Calibration) -> WorkingModel:
-    """The model with every camera written in the model that its step refines."""
-    cameras = tuple(
-        camera if step is None else as_model(camera, step.model)
-        for camera, step in zip(model.cameras, calibration, strict=True)
-    )
-    return replace(model, cameras=cameras)
-
-
 def _solve(
     model: WorkingModel,
     points: Bool[np.ndarray, "t"],
@@ -145,7 +136,7 @@ def bundle_problem(
 
     The gauge stays free unless held views fix it: damping keeps the solution near its start.
     """
-    model = with_calibration(model, calibration)
+    model = replace(model, cameras=with_models(model.cameras, calibration))
     rows = model.used_observations()
     rows = rows[points[model.tracks.point[rows]]]
     registered = np.unique(model.tracks.view[rows]).tolist()

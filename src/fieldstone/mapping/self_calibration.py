@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import image_from_cam
-from fieldstone.mapping.calibration import LADDER, CalibrationStep
+from fieldstone.mapping.calibration import LADDER, CalibrationStep, steps_above
 from fieldstone.mapping.growth import covering_tracks, plane_coordinates
 from fieldstone.mapping.refinement import Calibration, RefinementOptions, adjust
 from fieldstone.mapping.working_model import WorkingModel
@@ -26,7 +26,8 @@ class SelfCalibrationOptions:
     held_out: float = 0.25
     """Share of the tracks that judge and take no part in the adjustment."""
     min_gain: float = 0.005
-    """A step must lower the mean squared error of prediction by this share at least."""
+    """A step must lower the mean squared error of prediction by this share at least; one with fewer parameters need
+    only lower it."""
     min_significance: float = 3.0
     """And by so many standard errors of the mean difference."""
     max_error_px: float = 4.0
@@ -59,7 +60,7 @@ def climb(
 
     Every step is fitted on the other tracks from the best model so far and judged on the same predictions: each
     observation of a held-out track from the point that its other observations give. The climb ends after two steps in
-    a row that are not believed.
+    a row that are not believed; where one radial term did not do, a fisheye lens is tried all the same.
 
     Returns:
         The calibration of each camera (None stays None), and every trial.
@@ -72,17 +73,22 @@ def climb(
         return tuple(calibration), []
     learners = covering_tracks(model, refinement.tracks_per_view) & ~judges
     best = tuple(calibration)
+    above = [() if step is None else steps_above(step, principal_point=options.principal_point) for step in calibration]
     fitted = adjust(model, refinement, best, bundle=refinement.final, points=learners)
     errors = np.minimum(prediction_errors(fitted, rows, predictions), options.max_error_px) ** 2
     trials: list[CalibrationTrial] = []
     refused = 0
-    for step in _steps_above(best, options.principal_point):
-        candidate = tuple(None if old is None else step for old in best)
+    for step in LADDER:
+        candidate = tuple(step if old is not None and step in above[c] else old for c, old in enumerate(best))
+        of_another_kind = step.model == "OPENCV_FISHEYE" and any(old is not None and "k2" in old.free for old in best)
+        if candidate == best or (refused == 2 and not of_another_kind):
+            continue
         richer = adjust(fitted, refinement, candidate, bundle=refinement.final, points=learners)
         new_errors = np.minimum(prediction_errors(richer, rows, predictions), options.max_error_px) ** 2
         gain = errors - new_errors
         significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
-        accepted = bool(gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance)
+        clear = gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance
+        accepted = bool(clear or (_num_free(candidate) < _num_free(best) and gain.mean() > 0.0))
         trials.append(
             CalibrationTrial(
                 step, float(np.sqrt(errors.mean())), float(np.sqrt(new_errors.mean())), significance, accepted
@@ -97,9 +103,11 @@ def climb(
             best, fitted, errors, refused = candidate, richer, new_errors, 0
         else:
             refused += 1
-            if refused == 2:
-                break
     return best, trials
+
+
+def _num_free(calibration: Sequence[CalibrationStep | None]) -> int:
+    return sum(len(step.free) for step in calibration if step is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,9 +165,3 @@ def _leave_one_out(point: Int[np.ndarray, "u"]) -> _Predictions:
     return _Predictions(
         np.arange(len(point)), members[others], np.concatenate([[0], np.cumsum(length - 1)]).astype(np.int64)
     )
-
-
-def _steps_above(calibration: Sequence[CalibrationStep | None], principal_point: bool) -> list[CalibrationStep]:
-    """The steps of the ladder that are richer than what is refined now."""
-    size = max(len(step.free) for step in calibration if step is not None)
-    return [step for step in LADDER if len(step.free) > size and (principal_point or "cx" not in step.free)]

@@ -1,0 +1,112 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldstone.features.verification import verify_pairs
+from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
+from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.calibration import LADDER, as_model, growing_step, priors, steps_above
+from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.synthetic.scenes import SceneOptions, synthesize
+from matchers import assert_reconstruction_near
+
+PLAIN = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 322.0, 238.0]))
+RADIAL = Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, -0.05]))
+FISHEYE = Camera("OPENCV_FISHEYE", 1000, 750, np.array([520.0, 521.0, 508.0, 371.0, 0.03, -0.01, 0.004, -0.001]))
+
+
+@pytest.mark.parametrize("step", LADDER[:-1], ids=lambda step: f"{step.model} {len(step.free)}")
+def test_a_camera_in_a_richer_model_sees_the_same(step):
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], size=(50, 3))
+    rich = as_model(PLAIN, step.model)
+    np.testing.assert_array_equal(image_from_cam(rich, points), image_from_cam(PLAIN, points))
+    assert step.mask().sum() == len(step.free)
+    assert {prior.param for prior in priors([rich], [step])} == set(np.flatnonzero(step.mask()).tolist())
+
+
+def test_a_model_that_cannot_express_the_camera_is_refused():
+    assert as_model(RADIAL, "OPENCV").coefficients.tolist() == [0.1, -0.05, 0, 0]
+    for camera, model in ((RADIAL, "SIMPLE_RADIAL"), (FISHEYE, "FULL_OPENCV")):
+        with pytest.raises(ValueError, match="cannot express"):
+            as_model(camera, model)
+
+
+@pytest.mark.parametrize("camera", [PLAIN, RADIAL, as_model(RADIAL, "FULL_OPENCV")], ids=lambda camera: camera.model)
+def test_a_fisheye_camera_is_fitted_to_what_another_one_sees(camera):
+    """Within a quarter of a pixel, all over the photo, though the two laws share no parameter."""
+    x, y = np.meshgrid(np.linspace(0, 640, 17), np.linspace(0, 480, 13))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    rays = np.concatenate([plane_from_image(camera, pixels), np.ones((len(pixels), 1))], axis=1)
+    seen = image_from_cam(as_model(camera, "OPENCV_FISHEYE"), rays)
+    np.testing.assert_allclose(seen, pixels, atol=0.25)
+
+
+def test_what_is_given_is_refined_in_the_first_model_that_expresses_it():
+    cameras = {
+        "SIMPLE_RADIAL": [PLAIN, Camera("OPENCV", 640, 480, np.array([500.0, 500, 320, 240, 0.1, 0, 0, 0]))],
+        "RADIAL": [RADIAL, Camera("OPENCV", 640, 480, np.array([500.0, 500, 320, 240, 0.1, 0.02, 0, 0]))],
+        "OPENCV": [
+            Camera("PINHOLE", 640, 480, np.array([500.0, 510, 320, 240])),
+            Camera("OPENCV", 640, 480, np.array([500.0, 500, 320, 240, 0.1, 0, 0.001, 0])),
+        ],
+        "FULL_OPENCV": [Camera("FULL_OPENCV", 640, 480, np.array([500.0, 500, 320, 240, 0, 0, 0, 0, 0, 0.1, 0, 0]))],
+        "OPENCV_FISHEYE": [FISHEYE],
+    }
+    for model, all_of_it in cameras.items():
+        for camera in all_of_it:
+            step = growing_step(camera)
+            assert step.model == model
+            as_model(camera, model)
+            assert not any("cx" in other.free for other in steps_above(step, principal_point=False))
+
+
+def test_every_step_above_refines_more():
+    for step in LADDER:
+        above = steps_above(step)
+        assert step not in above
+        assert all(set(other.free) > set(step.free) for other in above if other.model == step.model)
+        assert [LADDER.index(other) for other in above] == sorted(LADDER.index(other) for other in above)
+    assert steps_above(LADDER[-1]) == []
+
+
+def map_with(truth: Camera, start: Camera, **scene_options):
+    options = {"num_cameras": 10, "num_points": 1200, "layout": "arc", "noise_px": 0.3, "camera": truth}
+    scene = synthesize(SceneOptions(**(options | scene_options)), np.random.default_rng(0))
+    camera_of_image = np.zeros(scene.graph.num_images, dtype=np.int64)
+    graph = verify_pairs(scene.graph, [start], camera_of_image, TwoViewOptions(), 0, 2)
+    return scene, map_automatic(graph, [start], camera_of_image, np.array([False]), AutomaticOptions(), 0)
+
+
+def test_given_fisheye_cameras_are_refined():
+    start = replace(FISHEYE, params=FISHEYE.params + np.array([6.0, 7.0, -8, 4, -0.03, 0.01, -0.004, 0.001]))
+    scene, run = map_with(FISHEYE, start)
+    camera = run.reconstruction.cameras[0]
+    assert camera.model == "OPENCV_FISHEYE"
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.1, relative_distance=0.005)
+    np.testing.assert_allclose(camera.focal, FISHEYE.focal, rtol=0.003)
+
+
+def test_a_strong_fisheye_lens_is_recognised():
+    """Nothing but a focal length is given; the photos see 140 degrees across."""
+    truth = Camera("OPENCV_FISHEYE", 1000, 750, np.array([380.0, 380.0, 500.0, 375.0, 0.0, 0.0, 0.0, 0.0]))
+    start = Camera("SIMPLE_PINHOLE", 1000, 750, np.array([380.0, 500.0, 375.0]))
+    scene, run = map_with(truth, start, layout="street", num_points=2000)
+    assert run.reconstruction.cameras[0].model == "OPENCV_FISHEYE"
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.1, relative_distance=0.005)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        Camera("OPENCV", 1000, 750, np.array([800.0, 806.0, 515.0, 366.0, 0.05, -0.02, 0.002, -0.001])),
+        Camera("PINHOLE", 1000, 750, np.array([800.0, 840.0, 500.0, 375.0])),
+    ],
+    ids=lambda camera: camera.model,
+)
+def test_given_rich_cameras_are_refined_in_their_model(truth):
+    start = replace(truth, params=truth.params * np.where(np.arange(len(truth.params)) < 2, 1.02, 1.0))
+    scene, run = map_with(truth, start)
+    assert run.reconstruction.cameras[0].spec.num_focal == 2
+    np.testing.assert_allclose(run.reconstruction.cameras[0].focal, truth.focal, rtol=0.003)
+    assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.1, relative_distance=0.005)
