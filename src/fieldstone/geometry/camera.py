@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fieldstone.geometry import distortion
 
@@ -202,3 +202,22 @@ def rescale(camera: Camera, width: int, height: int) -> Camera:
     params[: spec.num_focal] *= scale if spec.num_focal == 2 else scale.mean()
     params[spec.num_focal : spec.num_focal + 2] *= scale
     return Camera(camera.model, width, height, params)
+
+
+def turned(camera: Camera, turn: Int[np.ndarray, "2 2"]) -> Camera:
+    """The camera of the same photo turned by quarters or mirrored: directions (right, down) become `turn` of them.
+
+    Args:
+        turn: Orthogonal, of 0, 1 and -1.
+    """
+    spec, size = camera.spec, np.array([camera.width, camera.height])
+    new_size = np.abs(turn) @ size
+    params = camera.params.copy()
+    if spec.num_focal == 2:
+        params[:2] = np.abs(turn) @ camera.focal
+    params[spec.num_focal : spec.num_focal + 2] = turn @ (camera.principal_point - size / 2) + new_size / 2
+    if "p1" in spec.coefficient_names:
+        # Tangential distortion is r^2 q + 2 (q . uv) uv with q = (p2, p1), a direction like any other.
+        at = [spec.param_names.index(name) for name in ("p2", "p1")]
+        params[at] = turn @ params[at]
+    return Camera(camera.model, int(new_size[0]), int(new_size[1]), params)

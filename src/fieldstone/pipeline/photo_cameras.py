@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.features.verification import MAX_VOTING_PAIRS, calibrate_from_pairs
-from fieldstone.geometry.camera import Camera, rescale
+from fieldstone.geometry.camera import Camera, rescale, turned
 from fieldstone.io.photos import PhotoInfo
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.match_graph import MatchGraph
@@ -28,6 +28,17 @@ PAIRS_TO_CHECK_EXIF = 30
 MIN_CONTRAST_AGAINST_EXIF = 0.3
 MAX_EXIF_ERROR = 2.0
 """EXIF is off by a tenth now and then; off by this factor it belongs to another lens or crop."""
+
+TURNED_UPRIGHT = {
+    2: ((-1, 0), (0, 1)),
+    3: ((-1, 0), (0, -1)),
+    4: ((1, 0), (0, -1)),
+    5: ((0, 1), (1, 0)),
+    6: ((0, -1), (1, 0)),
+    7: ((0, -1), (-1, 0)),
+    8: ((0, 1), (-1, 0)),
+}
+"""Where right and down of the stored pixels point in the upright photo, by EXIF orientation (1: right and down)."""
 
 
 def gps_positions(infos: Sequence[PhotoInfo]) -> Float[np.ndarray, "n 3"] | None:
@@ -56,7 +67,7 @@ def cameras_of_photos(
 ) -> tuple[tuple[Camera, ...], Int[np.ndarray, "n"], list[str]]:
     """Cameras, the camera of each photo, and where each camera's focal length comes from: given, exif or guess.
 
-    Photos of one size, EXIF camera and EXIF focal length share a camera.
+    Photos of one size, EXIF camera, EXIF focal length and orientation share a camera.
     """
     cameras: list[Camera] = []
     source: list[str] = []
@@ -64,11 +75,12 @@ def cameras_of_photos(
     camera_of_image = np.empty(len(infos), dtype=np.int64)
     for k, info in enumerate(infos):
         exif = (None, None) if options.single_camera else (info.exif.camera, info.exif.focal_px)
-        key = (info.width, info.height, *exif)
+        # The camera held upside down has its principal point on the other side.
+        key = (info.width, info.height, info.orientation, *exif)
         if key not in index:
             index[key] = len(cameras)
             if options.intrinsics is not None:
-                cameras.append(_given_camera(options, info.width, info.height))
+                cameras.append(_given_camera(options, info))
                 source.append("given")
             else:
                 focal = info.exif.focal_px or GUESSED_FOCAL * max(info.width, info.height)
@@ -132,13 +144,15 @@ def contradicts(vote: FocalVote, camera: Camera) -> bool:
     return vote.contrast >= MIN_CONTRAST_AGAINST_EXIF and not 1.0 / MAX_EXIF_ERROR < factor < MAX_EXIF_ERROR
 
 
-def _given_camera(options: MatchingOptions, width: int, height: int) -> Camera:
-    """The camera of --intrinsics for a photo of this size."""
+def _given_camera(options: MatchingOptions, info: PhotoInfo) -> Camera:
+    """The camera of --intrinsics, which speaks of stored pixels, for an upright photo."""
     assert options.intrinsics is not None
     values = np.array(options.intrinsics, dtype=np.float64)
     model = options.camera_model or ("SIMPLE_PINHOLE" if len(values) == 3 else "PINHOLE")
+    turn = np.array(TURNED_UPRIGHT.get(info.orientation, ((1, 0), (0, 1))))
+    width, height = np.abs(turn) @ [info.width, info.height]
     try:
-        return Camera(model, width, height, values)
+        return turned(Camera(model, int(width), int(height), values), turn)
     except ValueError as error:
         raise InputError(f"--intrinsics {','.join(map(str, options.intrinsics))}: {error}") from error
 

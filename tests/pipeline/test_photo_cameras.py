@@ -1,0 +1,58 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fieldstone.errors import InputError
+from fieldstone.geometry.camera import Camera, image_from_plane
+from fieldstone.io.exif import ExifFacts
+from fieldstone.io.photos import PhotoInfo, turned_upright
+from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.pipeline.photo_cameras import cameras_of_photos
+
+STORED = Camera("OPENCV", 640, 480, np.array([500.0, 510, 322, 236, 0.1, -0.02, 0.003, -0.002]))
+
+
+def info_of(orientation: int, name: str = "a.jpg") -> PhotoInfo:
+    size = (480, 640) if orientation >= 5 else (640, 480)
+    return PhotoInfo(Path(name), *size, orientation, ExifFacts())
+
+
+def given(infos, **options):
+    intrinsics = tuple(STORED.params.tolist())
+    return cameras_of_photos(infos, MatchingOptions(camera_model="OPENCV", intrinsics=intrinsics, **options))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_given_intrinsics_speak_of_stored_pixels(orientation):
+    """What falls on a pixel of the stored photo falls on where turning the photo puts this pixel."""
+    (camera,), _, _ = given([info_of(orientation)])
+    # Photos that show how far right and how far down one is in the stored one.
+    row, column = np.mgrid[0:480, 0:640]
+    shown = [(column // 3).astype(np.uint8), (row // 2).astype(np.uint8)]
+    assert turned_upright(shown[0], orientation).shape == (camera.height, camera.width)
+    corner = turned_upright(np.array([[0, 1], [2, 3]], dtype=np.uint8), orientation)
+    origin, right, down = (np.argwhere(corner == value)[0, ::-1] for value in (0, 1, 2))
+    turn = np.stack([right - origin, down - origin], axis=1)
+    uv = np.random.default_rng(0).uniform([-0.5, -0.4], [0.5, 0.4], size=(200, 2))
+    x, y = np.floor(image_from_plane(STORED, uv)).astype(int).T
+    upright_x, upright_y = np.floor(image_from_plane(camera, uv @ turn.T)).astype(int).T
+    for photo in shown:
+        np.testing.assert_array_equal(turned_upright(photo, orientation)[upright_y, upright_x], photo[y, x])
+
+
+def test_photos_share_a_camera_unless_it_was_turned():
+    infos = [info_of(1, "a.jpg"), info_of(1, "b.jpg"), info_of(3, "c.jpg"), info_of(6, "d.jpg")]
+    for options in ({}, {"single_camera": True}):
+        cameras, camera_of_image, source = given(infos, **options)
+        assert camera_of_image.tolist() == [0, 0, 1, 2]
+        assert source == ["given"] * 3
+        assert cameras[1].principal_point.tolist() == [640 - 322, 480 - 236]
+        assert cameras[2].focal.tolist() == [510, 500]
+
+
+def test_intrinsics_that_do_not_fit_the_model_are_refused():
+    options = replace(MatchingOptions(), camera_model="OPENCV", intrinsics=(1.0, 2.0, 3.0))
+    with pytest.raises(InputError, match=r"--intrinsics 1\.0,2\.0,3\.0"):
+        cameras_of_photos([info_of(1)], options)
