@@ -1,3 +1,4 @@
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +19,10 @@ from fieldstone.solve.schur_solver import (
     camera_system,
     linearize,
     move,
-    solve_step,
     start_values,
     tile_pattern,
 )
+from fieldstone.solve.schur_step import solve_step
 
 PIVOT = np.array([0.3, -0.2, 0.5])
 ZERO = np.zeros(3)
@@ -36,14 +37,24 @@ PROBLEMS = {
 }
 
 
-def compiled_step(problem: BundleProblem, loss: tuple[int, float], damping: float) -> tuple[Values, float, float]:
+def compiled_step(
+    problem: BundleProblem,
+    loss: tuple[int, float],
+    damping: float,
+    *,
+    direct: bool = True,
+    tolerance: float = 1e-13,
+    threads: int = 1,
+) -> tuple[Values, float, float]:
     layout = lay_out(problem, np.ones(len(problem.view), dtype=bool))
     values = start_values(problem, layout)
-    workers, pattern = Workers(None, 1), tile_pattern(layout)
+    pool = ThreadPoolExecutor(threads) if threads > 1 else None
+    workers, pattern = Workers(pool, threads), tile_pattern(layout, None if direct else -1.0)
+    assert pattern.direct == direct
     work, at = allocate(layout, pattern), allocate_linearization(layout)
     cost = linearize(layout, values, loss, at, workers)
     system = camera_system(layout, values, PIVOT, at, work, workers)
-    step = solve_step(layout, pattern, values, PIVOT, at, system, damping, work, workers)
+    step = solve_step(layout, pattern, values, PIVOT, at, system, damping, work, workers, pcg_tolerance=tolerance)
     assert step is not None
     moved, promised = move(layout, values, PIVOT, at, step, damping, work, workers)
     points = np.empty_like(moved.points)
@@ -52,10 +63,13 @@ def compiled_step(problem: BundleProblem, loss: tuple[int, float], damping: floa
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize(("number", "loss"), [(0, trivial()), (1, huber(5.0)), (3, cauchy(5.0))])
-def test_compiled_step_matches_the_reference(name, number, loss):
+@pytest.mark.parametrize(
+    ("number", "loss", "direct"),
+    [(0, trivial(), True), (0, trivial(), False), (1, huber(5.0), True), (3, cauchy(5.0), True)],
+)
+def test_compiled_step_matches_the_reference(name, number, loss, direct):
     problem, damping = PROBLEMS[name], 1e-3
-    moved, cost, promised = compiled_step(problem, (number, 25.0), damping)
+    moved, cost, promised = compiled_step(problem, (number, 25.0), damping, direct=direct)
     equations = normal_equations(problem, loss, PIVOT)
     step = damped_step(problem, loss, PIVOT, damping)
     assert cost == pytest.approx(equations.cost, rel=1e-12)
@@ -69,6 +83,40 @@ def test_compiled_step_matches_the_reference(name, number, loss):
     delta = np.concatenate([step.pose_tangent.ravel(), step.camera_step.ravel(), step.point_step.ravel()])
     decrease = -equations.gradient @ delta - 0.5 * delta @ equations.H @ delta
     assert promised == pytest.approx(decrease, rel=1e-7)
+
+
+def tangent_of(problem: BundleProblem, moved: Values) -> np.ndarray:
+    """The step that led from the problem to other values, in the order of the reference's columns."""
+    R, t = problem.cam_from_world.R, problem.cam_from_world.t
+    omega = rotation.log(np.swapaxes(R, 1, 2) @ moved.R)
+    v = np.einsum("vji,vj->vi", R, moved.t + moved.R @ PIVOT - t) - PIVOT
+    longest = max(len(camera.params) for camera in problem.cameras)
+    cameras = np.zeros((len(problem.cameras), longest))
+    for row, new, camera in zip(cameras, moved.params, problem.cameras, strict=True):
+        row[: len(camera.params)] = new[: len(camera.params)] - camera.params
+    poses = np.concatenate([omega, v], axis=1)
+    return np.concatenate([poses.ravel(), cameras.ravel(), (moved.points - problem.points).ravel()])
+
+
+@pytest.mark.parametrize("name", ["mixed", "sparse"])
+def test_a_rough_solution_promises_what_the_linear_model_says(name):
+    problem, damping = PROBLEMS[name], 1e-3
+    exact, _, most = compiled_step(problem, (0, 25.0), damping)
+    rough, _, promised = compiled_step(problem, (0, 25.0), damping, direct=False, tolerance=0.3)
+    equations, delta = normal_equations(problem, trivial(), PIVOT), tangent_of(problem, rough)
+    decrease = -equations.gradient @ delta - 0.5 * delta @ equations.H @ delta
+    assert promised == pytest.approx(decrease, rel=1e-6)
+    assert 0.5 * most < promised < most
+    assert not np.allclose(exact.t, rough.t, atol=1e-9)
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_steps_are_the_same_for_any_number_of_threads(direct):
+    one, *costs = compiled_step(PROBLEMS["sparse"], (0, 25.0), 1e-3, direct=direct, tolerance=0.1)
+    three, *other_costs = compiled_step(PROBLEMS["sparse"], (0, 25.0), 1e-3, direct=direct, tolerance=0.1, threads=3)
+    assert costs == other_costs
+    for name in ("R", "t", "points", "params"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
 
 
 @pytest.mark.parametrize("name", ["mixed", "nothing held", "cameras only"])

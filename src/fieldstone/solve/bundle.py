@@ -39,10 +39,10 @@ from fieldstone.solve.schur_solver import (
     camera_system,
     linearize,
     move,
-    solve_step,
     start_values,
     tile_pattern,
 )
+from fieldstone.solve.schur_step import solve_step
 
 logger = logging.getLogger(__name__)
 

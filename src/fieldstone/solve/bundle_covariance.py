@@ -70,7 +70,7 @@ def bundle_covariance(
     values = start_values(problem, layout)
     seen = layout.point_start[1:] > layout.point_start[:-1]
     pivot = np.median(values.points[seen], axis=0)
-    pattern, workers = tile_pattern(layout), Workers(None, 1)
+    pattern, workers = tile_pattern(layout, None), Workers(None, 1)
     work, at = allocate(layout, pattern), allocate_linearization(layout)
     linearize(layout, values, (LOSS_NUMBERS[options.loss], options.loss_scale_px**2), at, workers)
     system = camera_system(layout, values, pivot, at, work, workers)

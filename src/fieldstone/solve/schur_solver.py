@@ -22,17 +22,14 @@ from fieldstone.solve.schur_numba import (
     reduce_border_numba,
     reduce_rows_numba,
 )
-from fieldstone.solve.tile_cholesky_numba import (
-    MAX_ROWS,
-    cholesky_in_place_numba,
-    factor_column_numba,
-    factor_diagonal_numba,
-    factor_numba,
-    solve_transposed_numba,
-)
+from fieldstone.solve.tile_cholesky_numba import MAX_ROWS
 
 MAX_SINGLE_TILE = 128
 """Reduced systems up to this size are factored as one tile, without BLAS."""
+FACTOR_PER_OBSERVATION = 1.5e4
+"""Multiply-adds of a factorisation, for each observation, beyond which conjugate gradients take less time."""
+MAX_FACTOR_BYTES = 4e9
+"""Larger factors are not stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +71,10 @@ class Workers:
 
 @dataclass(frozen=True, eq=False)
 class TilePattern:
-    """Which tiles of the reduced system exist; tiles beyond `num_given` appear only in the factor."""
+    """Which tiles of the reduced system exist; tiles beyond `num_given` appear only in the factor.
+
+    Where the system is not factored, the tiles are those of its block diagonal.
+    """
 
     per_tile: int
     index: Int[np.ndarray, "t t"]
@@ -82,6 +82,8 @@ class TilePattern:
     num_tiles: int
     num_products: int
     """Tile products of one factorisation."""
+    direct: bool = True
+    """Whether the system is factored, or solved by conjugate gradients."""
 
     @property
     def given_index(self) -> Int[np.ndarray, "t t"]:
@@ -161,8 +163,13 @@ def start_values(problem: BundleProblem, layout: BundleLayout) -> Values:
     )
 
 
-def tile_pattern(layout: BundleLayout) -> TilePattern:
-    """Tiles of slots that share points, and those that factorisation fills in."""
+def tile_pattern(layout: BundleLayout, factor_per_observation: float | None = FACTOR_PER_OBSERVATION) -> TilePattern:
+    """Tiles of slots that share points, and those that factorisation fills in.
+
+    Args:
+        factor_per_observation: Multiply-adds of a factorisation that is worth it, for each observation; where it takes
+            more the pattern is that of the block diagonal. None: the factor is needed, whatever it takes.
+    """
     limit = MAX_SINGLE_TILE if layout.num_columns <= MAX_SINGLE_TILE else MAX_ROWS
     per_tile = max(1, min(limit // layout.block, layout.num_slots))
     count = -(-layout.num_slots // per_tile)
@@ -179,7 +186,15 @@ def tile_pattern(layout: BundleLayout) -> TilePattern:
         index[i[fill], j[fill]] = num_tiles + np.arange(fill.sum())
         num_tiles += int(fill.sum())
     per_column = np.sum(np.tril(index >= 0, -1), axis=0)
-    return TilePattern(per_tile, index, num_given, num_tiles, int(np.sum(per_column * (per_column + 3) // 2)))
+    num_products = int(np.sum(per_column * (per_column + 3) // 2))
+    size = per_tile * layout.block
+    too_dear = factor_per_observation is not None and (
+        num_products * size**3 > factor_per_observation * len(layout.view) or 8 * num_tiles * size**2 > MAX_FACTOR_BYTES
+    )
+    if too_dear:
+        diagonal = np.where(np.eye(count, dtype=bool), np.arange(count), -1)
+        return TilePattern(per_tile, diagonal, count, count, 0, direct=False)
+    return TilePattern(per_tile, index, num_given, num_tiles, num_products)
 
 
 def allocate_linearization(layout: BundleLayout) -> Linearization:
@@ -274,70 +289,6 @@ def reduce_system(
             layout.num_active, layout.border_of_camera, work.Z_border, work.y, corner, rhs_border,
         )  # fmt: skip
     return ReducedSystem(border, rhs, corner, rhs_border)
-
-
-def solve_step(
-    layout: BundleLayout, pattern: TilePattern, values: Values, pivot: Float[np.ndarray, "3"], at: Linearization,
-    system: CameraSystem, damping: float, work: Workspace, workers: Workers,
-) -> Step | None:  # fmt: skip
-    """The damped step of poses and cameras; None where the reduced system is not positive definite."""
-    reduced = reduce_system(layout, pattern, values, pivot, at, system, damping, work, workers)
-    solution = _solve_reduced(pattern, reduced, work, workers)
-    if solution is None:
-        return None
-    dx, dx_border = solution
-    promised = np.sum((damping * np.einsum("saa->sa", system.U) * dx - system.g) * dx)
-    promised += np.sum((damping * np.diag(system.corner) * dx_border - system.g_border) * dx_border)
-    return Step(dx, dx_border, 0.5 * float(promised))
-
-
-def _solve_reduced(
-    pattern: TilePattern, reduced: ReducedSystem, work: Workspace, workers: Workers
-) -> tuple[Float[np.ndarray, "s b"], Float[np.ndarray, "n"]] | None:
-    """Solve [[S, border^T], [border, corner]] [dx; dx_border] = [rhs; rhs_border] by block elimination."""
-    border, rhs, corner, rhs_border = reduced.border, reduced.rhs, reduced.corner, reduced.rhs_border
-    n, (s, b) = len(border), rhs.shape
-    count, size = len(pattern.index), pattern.per_tile * b
-    wide = np.zeros((n + 1, count * size))
-    wide[:n, : s * b] = border.reshape(n, s * b)
-    wide[n, : s * b] = rhs.ravel()
-    wide = np.ascontiguousarray(wide.reshape(n + 1, count, size).swapaxes(0, 1))
-    if not _factor(pattern, wide, s, work, workers):
-        return None
-    flat = wide.swapaxes(0, 1).reshape(n + 1, count * size)
-    dx_border = np.zeros(n)
-    if n:
-        corner = corner - flat[:n] @ flat[:n].T
-        if not cholesky_in_place_numba(corner):
-            return None
-        dx_border = _solve_lower(corner, rhs_border - flat[:n] @ flat[n])
-    x = np.ascontiguousarray((flat[n] - dx_border @ flat[:n]).reshape(count, size))
-    solve_transposed_numba(pattern.index, work.L, work.diagonal_inverse, x)
-    dx = x.ravel()[: s * b].reshape(s, b)
-    if not (np.all(np.isfinite(dx)) and np.all(np.isfinite(dx_border))):
-        return None
-    return dx, dx_border
-
-
-def _factor(
-    pattern: TilePattern, wide: Float[np.ndarray, "t r n"], num_slots: int, work: Workspace, workers: Workers
-) -> bool:
-    """Tile Cholesky of the reduced system; `wide` becomes the rows below it."""
-    args = (work.tiles, pattern.index, work.L, work.diagonal_inverse, num_slots)
-    if workers.threads == 1 or len(pattern.index) < 8:
-        return factor_numba(*args, wide)
-    for J in range(len(pattern.index)):
-        if not factor_diagonal_numba(J, *args):
-            return False
-        bounds = [(J, k, workers.threads) for k in range(workers.threads)]
-        workers.over(factor_column_numba, bounds, *args, wide)
-    return True
-
-
-def _solve_lower(L: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """x with L L^T x = b."""
-    x = np.linalg.solve(L, b)
-    return np.linalg.solve(L.T, x)
 
 
 def move(
