@@ -21,6 +21,7 @@ import numpy as np
 
 from fieldstone.field.fast_decoder import HIDDEN
 from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
+from fieldstone.field.fast_exposure import gains_of
 from fieldstone.field.fast_field import FOREVER
 from fieldstone.field.fast_grid_numba import add_gradient, step_by_sample, step_touched
 from fieldstone.field.fast_march_numba import composite_backward, march_rays
@@ -69,7 +70,7 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
     with ThreadPoolExecutor(1) as executor:
         training = fast_training(
             dataset.train, dataset.frame, plan, seed=0, executor=executor, use_alpha=use_alpha,
-            points_in_world=dataset.points_in_world, bounded=dataset.bounded,
+            points_in_world=dataset.points_in_world, seen=dataset.seen, bounded=dataset.bounded,
         )  # fmt: skip
         rows, about = kernel_times(training, training.from_tensors(state_tensors))
     show(about)
@@ -86,11 +87,12 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
     count, levels = int(state.chunk_rays[0]), field.layout.num_levels
     background = training.frame.background.astype(np.float32)
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
+    gains = gains_of(state.exposure)
     rates, velocity = np.zeros(8, np.float32), state.velocity
     tiny, decay = np.float32(1e-8), np.float32(plan.decay)
 
     def draw() -> None:
-        draw_rays(training.rays, training.projection, state.cursor, count, 0, background, rays)
+        draw_rays(training.rays, training.projection, gains, state.cursor, count, 0, background, rays, 0)
 
     def march() -> tuple[int, int, int]:
         return march_rays(
@@ -108,8 +110,8 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
 
     def composite() -> None:
         composite_backward(
-            samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, np.float32(1e-2),
-            np.float32(plan.sparsity), work.d_color, work.d_raw,
+            samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb,
+            work.d_weight, np.float32(1e-2), np.float32(plan.sparsity), work.d_color, work.d_raw, work.d_gain,
         )  # fmt: skip
 
     def back() -> None:

@@ -35,6 +35,8 @@ def train(
     plan: Path | None = None,
     alpha: bool = True,
     photos: Path | None = None,
+    masks: Path | None = None,
+    size: int | None = None,
     device: str = "cpu",
     threads: int = 0,
     seed: int = 0,
@@ -54,6 +56,9 @@ def train(
         plan: The plan.json that an earlier run of the fast field left: the same plan gives the same bytes.
         alpha: Use the transparency of photos; --no-alpha takes them as they look on the background (fast only).
         photos: Folder with the photos of a reconstruction, if they are not where they were.
+        masks: Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. Nothing is learned where
+            they are black, nor measured (fast only).
+        size: Photos are reduced to this length of their longer side, in pixels (fast only).
         device: cpu, cuda, mps (tiny and nerf).
         threads: 0 takes all cores. The result is the same for any number.
         seed: Every random number of the run follows from it.
@@ -65,6 +70,10 @@ def train(
 
     if field != "fast" and (plan is not None or not alpha):
         raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
+    if field != "fast" and (masks is not None or size is not None):
+        raise InputError(f"--masks and --size belong to the fast field; leave them out for --field {field}")
+    if size is not None and size < 1:
+        raise InputError(f"--size {size}: the longer side of a photo has at least one pixel")
     if field == "fast" and device != "cpu":
         raise InputError(f"the fast field runs on the CPU, not on {device}; leave --device out")
     budget_s = seconds(budget or QUALITIES[quality])
@@ -87,7 +96,9 @@ def train(
             "on_stage": lambda stage: progress.update(task, description=stage),
         }
         if field == "fast":
-            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, memory_gib=memory, **shared)
+            if size is not None:
+                shared["size_px"] = size
+            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, memory_gib=memory, masks=masks, **shared)
         else:
             metrics = train_run(source, out, field=field, device=device, **shared)
     done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"

@@ -10,6 +10,8 @@ from fieldstone.field.fast_field import FOREVER, renderer, room_for_samples
 from fieldstone.field.fast_grid import interpolate
 from fieldstone.field.fast_grid_numba import BLOCK, add_gradient
 from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
+from fieldstone.field.fast_terms_numba import PointRays, point_terms
+from fieldstone.field.known_points import no_known_rays
 from fieldstone.field.volume_rendering import composite
 from fieldstone.scene.rays import Rays
 
@@ -17,10 +19,15 @@ ROOM = 4096
 
 
 def forward_and_backward(
-    field, origins, directions, target, background, sparsity=0.0
-) -> tuple[float, Decoder, np.ndarray, Samples, int]:
-    """Loss, its gradient by group, and the samples of all rays."""
+    field, origins, directions, target, background, sparsity=0.0, gain=None, points=None, point_weight=0.0
+) -> tuple[float, Decoder, np.ndarray, Samples, int, np.ndarray]:
+    """Squared colour errors, the gradient of the loss by group, the samples of all rays, and the gradient of gains.
+
+    points: (rows, PointRays), row of the known point on each ray; none by default.
+    """
     count = len(origins)
+    gain = np.ones((count, 3), np.float32) if gain is None else gain
+    rows, on_rays = points or (np.full(count, -1), no_known_rays()[1])
     grid, box, march = field.layout.arrays(field.table), field.box(), field.march(0.0, 0.0)
     samples, width, used = room_for_samples(ROOM, field.width), field.width, 4 * field.layout.num_levels
     first, passed = np.zeros(count + 1, np.int64), np.zeros(count, np.float32)
@@ -44,19 +51,12 @@ def forward_and_backward(
     rgb, d_color, d_raw = np.zeros(3 * ROOM, np.float32), np.zeros(3 * ROOM, np.float32), np.zeros(ROOM, np.float32)
     decode_directions(field.decoder, directions.reshape(-1), count, per_ray)
     decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
+    d_weight, d_gain = np.full(ROOM, 7.0, np.float32), np.zeros(3 * count, np.float32)
+    point_terms(samples, count, first, rows, on_rays, march.step, np.float32(point_weight), d_weight)
     loss = composite_backward(
-        samples,
-        count,
-        first,
-        passed,
-        target.reshape(-1),
-        background.reshape(-1),
-        rgb,
-        np.float32(2),
-        np.float32(sparsity),
-        d_color,
-        d_raw,
-    )
+        samples, count, first, passed, target.reshape(-1), background.reshape(-1), gain.reshape(-1), rgb, d_weight,
+        np.float32(2), np.float32(sparsity), d_color, d_raw, d_gain,
+    )  # fmt: skip
     gradient = Decoder(*(np.zeros_like(weights) for weights in field.decoder))
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
     decode_backward(
@@ -70,7 +70,7 @@ def forward_and_backward(
             add_gradient(
                 grid, level, half, np.array([n]), ROOM, samples.position, samples.features, width, table, touched
             )
-    return loss, gradient, table[: field.layout.num_values], samples, n
+    return loss, gradient, table[: field.layout.num_values], samples, n, d_gain.reshape(count, 3)
 
 
 @pytest.fixture
@@ -86,31 +86,57 @@ def relative_error(actual, expected):
     return np.linalg.norm(actual - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("sparsity", [0.0, 0.7])
-def test_gradients_match_autograd(case, sparsity):
+def known_points(rng, directions) -> tuple[np.ndarray, PointRays]:
+    """Points on every other ray, some before the box and some behind it."""
+    count = len(directions)
+    rows = np.where(np.arange(count) % 2 == 0, np.arange(count) // 2, -1)
+    distance, sigma = rng.uniform(2.5, 5.5, count // 2), rng.uniform(0.0, 0.1, count // 2)
+    return rows, PointRays(*np.stack([distance, sigma, np.ones(count // 2)]).astype(np.float32))
+
+
+def point_loss(points, samples, n, step, weight) -> np.ndarray:
+    """What the weight of each sample counts, by the definition."""
+    rows, on_rays = points
+    row = rows[samples.ray[:n]]
+    margin = 2.0 * on_rays.sigma[row] + step
+    before = samples.distance[:n] < on_rays.distance[row] - margin
+    there = (samples.distance[:n] <= on_rays.distance[row] + margin) & ~before
+    return np.where(row < 0, 0.0, weight * (before.astype(float) - there))
+
+
+@pytest.mark.parametrize(("sparsity", "point_weight"), [(0.0, 0.0), (0.7, 0.0), (0.0, 0.4)])
+def test_gradients_match_autograd(case, sparsity, point_weight):
     torch = pytest.importorskip("torch")
-    from fieldstone.field.torch_field import packed_colors, torch_fast_field
+    from fieldstone.field.torch_field import packed_colors, packed_weights, torch_fast_field
 
     field, _, directions, target, background = case
-    loss, gradient, table, samples, n = forward_and_backward(*case, sparsity=sparsity)
-    twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
-    arguments = (
-        torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64)),
-        torch.tensor(samples.ray[:n].astype(np.int64)),
-        torch.tensor(directions.astype(np.float64)),
+    rng = np.random.default_rng(4)
+    gain = rng.uniform(0.7, 1.4, (60, 3)).astype(np.float32)
+    points = known_points(rng, directions)
+    loss, gradient, table, samples, n, d_gain = forward_and_backward(
+        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight
     )
+    twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
+    positions = torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64))
+    ray = torch.tensor(samples.ray[:n].astype(np.int64))
     scale = float(field.march(0.0, 0.0).depth_scale)
-    colors = packed_colors(twin, *arguments, torch.tensor(background.astype(np.float64)), scale)
-    squared = ((colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
-    # What a white background adds to a black one is the light that passes.
-    white, black = torch.ones(60, 3, dtype=torch.float64), torch.zeros(60, 3, dtype=torch.float64)
-    passed = (packed_colors(twin, *arguments, white, scale) - packed_colors(twin, *arguments, black, scale))[:, 0]
-    parameters = [*(twin.decoder[name] for name in Decoder._fields), *twin.levels]
-    expected = [g.numpy() for g in torch.autograd.grad(squared + sparsity * (1.0 - passed).sum(), parameters)]
+    colors = packed_colors(
+        twin, positions, ray, torch.tensor(directions.astype(np.float64)),
+        torch.tensor(background.astype(np.float64)), scale,
+    )  # fmt: skip
+    weights = packed_weights(twin, positions, ray, len(directions), scale)
+    theta = torch.tensor(np.log(gain.astype(np.float64)), requires_grad=True)
+    squared = ((theta.exp() * colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
+    opacity = torch.zeros(60, dtype=torch.float64).index_add(0, ray, weights)
+    by_sample = point_loss(points, samples, n, float(field.march(0.0, 0.0).step), point_weight)
+    total = squared + sparsity * opacity.sum() + (torch.tensor(by_sample) * weights).sum()
+    parameters = [*(twin.decoder[name] for name in Decoder._fields), *twin.levels, theta]
+    expected = [g.numpy() for g in torch.autograd.grad(total, parameters)]
     assert loss == pytest.approx(squared.item(), rel=1e-4)
+    assert relative_error(d_gain, expected[-1]) < 1e-4
     for name, of_group in zip(Decoder._fields, expected, strict=False):
         assert relative_error(getattr(gradient, name), of_group) < 1e-4, name
-    for level, of_level in enumerate(expected[len(Decoder._fields) :]):
+    for level, of_level in enumerate(expected[len(Decoder._fields) : -1]):
         actual = field.layout.level(table, level)
         for channel in range(4):
             assert relative_error(actual[..., channel], of_level[..., channel]) < 1e-4, (level, channel)
@@ -118,7 +144,7 @@ def test_gradients_match_autograd(case, sparsity):
 
 def test_gradients_match_finite_differences(case):
     field, *rest = case
-    _, gradient, table, _, _ = forward_and_backward(field, *rest)
+    _, gradient, table, *_ = forward_and_backward(field, *rest)
     groups = {"color_bias": (field.decoder.color_bias, gradient.color_bias), "table": (field.table, table)}
     for name, (values, derivative) in groups.items():
         for index in np.argsort(-np.abs(derivative))[:3]:

@@ -222,12 +222,17 @@ def composite_numba(samples, num_rays, first, passed, far, background, rgb, colo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def composite_backward(samples, num_rays, first, passed, target, background, rgb, scale, sparsity, d_color, d_raw):
-    """Squared colour errors, summed up, and `scale` times half the gradient of this sum and the opacities.
+def composite_backward(
+    samples, num_rays, first, passed, target, background, gain, rgb, d_weight, scale, sparsity, d_color, d_raw, d_gain
+):
+    """Squared colour errors, summed up, and `scale` times half the gradient of this sum and of what else counts.
 
-    The opacity of a ray, 1 - T_end, counts `sparsity` times: fog in the colour of the background costs nothing else.
-    With g = C - target and w_i = T_i alpha_i:  dC / dtau_i = T_(i+1) c_i - sum_{j>i} w_j c_j - T_end background,
-    dtau / draw = tau. d_color: (s, 3) gradient before the sigmoid. d_raw: (s).
+    A photo shows gain C: its exposure and white balance by channel. The opacity of a ray, 1 - T_end, counts
+    `sparsity` times: fog in the colour of the background costs nothing else. Whatever else counts says by d_weight
+    how it depends on the weight of each sample. With g = gain (gain C - target) and w_i = T_i alpha_i:
+    dC / dtau_i = T_(i+1) c_i - sum_{j>i} w_j c_j - T_end background,  dtau / draw = tau.
+    d_weight: (s) half the derivative by w_i. d_color: (s, 3) gradient before the sigmoid. d_raw: (s). gain, d_gain:
+    (r, 3), the gradient by the logarithm of the gain.
 
     Source:
         `max1995`, section 3, differentiated.
@@ -243,16 +248,20 @@ def composite_backward(samples, num_rays, first, passed, target, background, rgb
             g0 += weight * at(rgb, i * 3)
             g1 += weight * at(rgb, i * 3 + 1)
             g2 += weight * at(rgb, i * 3 + 2)
-        g0, g1, g2 = g0 - target[ray * 3], g1 - target[ray * 3 + 1], g2 - target[ray * 3 + 2]
+        r, g, b = gain[ray * 3], gain[ray * 3 + 1], gain[ray * 3 + 2]
+        shown0, shown1, shown2 = r * g0, g * g1, b * g2
+        g0, g1, g2 = shown0 - target[ray * 3], shown1 - target[ray * 3 + 1], shown2 - target[ray * 3 + 2]
         loss += g0 * g0 + g1 * g1 + g2 * g2
-        g0, g1, g2 = g0 * scale, g1 * scale, g2 * scale
+        d_gain[ray * 3], d_gain[ray * 3 + 1] = g0 * shown0 * scale, g1 * shown1 * scale
+        d_gain[ray * 3 + 2] = g2 * shown2 * scale
+        g0, g1, g2 = g0 * r * scale, g1 * g * scale, g2 * b * scale
         behind = left * (background[ray * 3] * g0 + background[ray * 3 + 1] * g1 + background[ray * 3 + 2] * g2)
         behind -= np.float32(0.5) * scale * sparsity * left
         for i in range(end - 1, start - 1, -1):
             light, alpha = at(samples.light, i), at(samples.alpha, i)
             weight = light * alpha
             r, g, b = at(rgb, i * 3), at(rgb, i * 3 + 1), at(rgb, i * 3 + 2)
-            own = r * g0 + g * g1 + b * g2
+            own = r * g0 + g * g1 + b * g2 + scale * at(d_weight, i)
             d_raw[i] = (light * (one - alpha) * own - behind) * at(samples.tau, i)
             behind += weight * own
             d_color[i * 3] = weight * g0 * r * (one - r)

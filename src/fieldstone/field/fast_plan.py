@@ -57,12 +57,18 @@ class FastPlan:
     prune_density: float = 0.05
     """Cells with less than this everywhere are given up. More than the density of the start: what no ray has asked for
     by then goes too."""
+    clear_fog_from: int = len(STAGE_SHARES)
+    """From this stage on, cells that are no denser than at the start are given up too."""
     immediate_levels: int = 1
     """Finest levels that move sample by sample."""
     scout: bool = True
     """The first stage only finds out where something is; then training begins again, in a box around it."""
     sparsity: float = 2e-3
     """Weight of the opacity of a ray against its squared colour error."""
+    exposure_rate: float = 0.0
+    """Step of the logarithm of a photo's exposure, at the start of training; 0: all photos are alike."""
+    point_weight: float = 0.0
+    """Weight of light that misses a known point against the squared colour error of its ray; falls with the rates."""
     stop_after: int | None = None
     """Where training stopped because the time was over, if the machine became slower than any correction foresaw."""
 
@@ -141,8 +147,9 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
     if bounded:
         return FastPlan(finest, steps, samples_per_chunk=room)
     return FastPlan(
-        finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3
-    )
+        finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
+        clear_fog_from=4, exposure_rate=0.005, point_weight=0.5,
+    )  # fmt: skip
 
 
 def plan_for_budget(plan: FastPlan, budget_s: float, spent_s: float, seconds_per_step: float) -> FastPlan:

@@ -12,7 +12,7 @@ from fieldstone.errors import InputError
 from fieldstone.field.fast_march_numba import Box
 from fieldstone.field.occupancy_numba import rays_that_hit
 from fieldstone.field.radiance_field import FieldFrame
-from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.field.ray_dataset import PosedImage, poses_in_frame
 from fieldstone.geometry.camera import bearings_from_image
 from fieldstone.scene.rays import pixel_centers
 
@@ -49,17 +49,16 @@ def ray_table(
         InputError: No ray meets the box.
     """
     first_bearing, bearings = _bearings(images)
-    poses = [image.cam_from_world for image in images]
-    rotation_of_frame = frame.normalized_from_world.R
-    rotations = np.stack([rotation_of_frame @ pose.R.T for pose in poses]).astype(np.float32)
-    centers = np.stack([frame.normalized_from_world.apply(pose.target_origin_in_source()) for pose in poses])
-    centers = centers.astype(np.float32)
+    rotations, centers = poses_in_frame(images, frame)
 
     def rows_of(v: int) -> tuple[np.ndarray, np.ndarray]:
         camera = images[v].camera
         first = first_bearing[id(camera)]
         in_cam = bearings[first : first + camera.width * camera.height]
         reached = np.isfinite(in_cam[:, 0])
+        keep = images[v].keep
+        if keep is not None:
+            reached &= keep.reshape(-1)
         if not box.unbounded:
             by_row = in_cam.reshape(camera.height, camera.width, 3)
             reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
@@ -72,7 +71,7 @@ def ray_table(
     if total == 0:
         raise InputError(
             "no training ray meets the scene: no photo looks at where the others see something; check the poses "
-            "and, if there are masks, that the object is opaque in them"
+            "and, if there are masks, that the scene is white in them"
         )
     return RayTable(
         image=np.repeat(np.arange(len(images), dtype=np.int32), counts),

@@ -10,6 +10,7 @@ from numba import njit
 from fieldstone.field.fast_decoder import Decoder
 from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
 from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
+from fieldstone.field.fast_terms_numba import point_terms
 
 GRADIENT_SCALE = np.float32(1e-2)
 """Constant factor on all gradients; RMSprop and Adam do not depend on it."""
@@ -25,6 +26,12 @@ class RayBatch(NamedTuple):
     """Directions as the camera looks, for the decoder."""
     target: np.ndarray
     background: np.ndarray
+    image: np.ndarray
+    """Which photo shows the ray."""
+    gain: np.ndarray
+    """Of that photo: how bright it shows each channel."""
+    point: np.ndarray
+    """Row of the known point on the ray, -1 without one."""
     jitter: np.ndarray
     first: np.ndarray
     passed: np.ndarray
@@ -39,15 +46,18 @@ class Work(NamedTuple):
     rgb: np.ndarray
     d_color: np.ndarray
     d_raw: np.ndarray
+    d_weight: np.ndarray
+    d_gain: np.ndarray
 
 
 class Chunk(NamedTuple):
-    """Room for one chunk. gradient: of the decoder, summed over the chunk."""
+    """Room for one chunk. gradient, gain_gradient: of the decoder and of the exposures, summed over the chunk."""
 
     rays: RayBatch
     samples: Samples
     work: Work
     gradient: Decoder
+    gain_gradient: np.ndarray
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -89,12 +99,16 @@ def project_ray_numba(projection, origins, directions, ray):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def draw_rays(table, projection, start, count, seed, background, rays):
-    """Rays number `start` to `start + count` of the table's sequence, with colours over the background."""
+def draw_rays(table, projection, gains, start, count, seed, background, rays, at):
+    """Rays number `start` to `start + count` of the table's sequence, with colours over the background.
+
+    They are put to place `at` and after. gains: (v, 3) flat, of each photo.
+    """
     rows = np.uint64(table.image.shape[0])
     scale = np.float32(1.0 / 255.0)
-    for n in range(count):
-        row = np.int64((np.uint64(start + n) % rows) * np.uint64(table.stride) % rows)
+    for k in range(count):
+        n = at + k
+        row = np.int64((np.uint64(start + k) % rows) * np.uint64(table.stride) % rows)
         v, b = table.image[row], table.bearing[row]
         x, y, z = table.bearings[b, 0], table.bearings[b, 1], table.bearings[b, 2]
         alpha = np.float32(table.rgba[row, 3]) * scale
@@ -105,9 +119,12 @@ def draw_rays(table, projection, start, count, seed, background, rays):
             )
             rays.views[n * 3 + c] = rays.directions[n * 3 + c]
             rays.background[n * 3 + c] = background[c]
+            rays.gain[n * 3 + c] = gains[v * 3 + c]
             color = np.float32(table.rgba[row, c]) * scale
             rays.target[n * 3 + c] = color * alpha + background[c] * (np.float32(1) - alpha)
-        rays.jitter[n] = random_share(seed, start + n)
+        rays.image[n] = v
+        rays.point[n] = row
+        rays.jitter[n] = random_share(seed, start + k)
         if projection.active:
             project_ray_numba(projection, rays.origins, rays.directions, n)
 
@@ -116,16 +133,21 @@ def draw_rays(table, projection, start, count, seed, background, rays):
 @no_type_check
 def chunk_step(
     table,
-    projection,
     start,
     count,
+    known,
+    points,
+    first_known,
+    num_known,
+    projection,
+    gains,
     seed,
     background,
     grid,
     box,
     march,
     far,
-    sparsity,
+    terms,
     decoder,
     transposed,
     width,
@@ -133,31 +155,29 @@ def chunk_step(
 ):
     """Gradients of one chunk: of the decoder in chunk.gradient, of the interpolated values in samples.features.
 
+    The first `num_known` rays are those of the table `known`, from number `first_known` on, with `points` on them.
     Returns (rays, samples, steps asked, sum of squared colour errors).
     """
     rays, samples, work = chunk.rays, chunk.samples, chunk.work
     used = 4 * grid.per_unit.shape[0]
-    draw_rays(table, projection, start, count, seed, background, rays)
+    draw_rays(known, projection, gains, first_known, num_known, seed + 1, background, rays, 0)
+    draw_rays(table, projection, gains, start, count, seed, background, rays, num_known)
+    rays.point[num_known : num_known + count] = -1
     num_rays, n, asked = march_rays(
-        grid,
-        box,
-        march,
-        rays.origins,
-        rays.directions,
-        rays.jitter,
-        far,
-        count,
-        width,
-        samples,
-        rays.first,
-        rays.passed,
-    )
+        grid, box, march, rays.origins, rays.directions, rays.jitter, far, num_known + count, width, samples,
+        rays.first, rays.passed,
+    )  # fmt: skip
     decode_directions(decoder, rays.views, num_rays, work.per_ray)
     decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
+    point_terms(samples, num_rays, rays.first, rays.point, points, march.step, terms.points, work.d_weight)
     loss = composite_backward(
-        samples, num_rays, rays.first, rays.passed, rays.target, rays.background, work.rgb, GRADIENT_SCALE,
-        sparsity, work.d_color, work.d_raw,
+        samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb, work.d_weight,
+        GRADIENT_SCALE, terms.sparsity, work.d_color, work.d_raw, work.d_gain,
     )  # fmt: skip
+    chunk.gain_gradient[:] = 0
+    for ray in range(num_rays):
+        for c in range(3):
+            chunk.gain_gradient[rays.image[ray] * 3 + c] += work.d_gain[ray * 3 + c]
     chunk.gradient.feature_weights[:] = 0
     chunk.gradient.direction_weights[:] = 0
     chunk.gradient.hidden_bias[:] = 0

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.field.fast_decoder import HIDDEN, Decoder, decoder_width, initial_decoder
+from fieldstone.field.fast_exposure import Exposure, gains_of, step_exposure, unit_exposure
 from fieldstone.field.fast_field import (
     FOREVER,
     REFERENCE_CELLS,
@@ -28,22 +29,23 @@ from fieldstone.field.fast_field import (
     renderer,
 )  # fmt: skip
 from fieldstone.field.fast_grid import CHANNELS, grid_layout
-from fieldstone.field.fast_grid_numba import add_gradient, step_by_sample, step_touched
 from fieldstone.field.fast_plan import FastPlan, plan_from_json
 from fieldstone.field.fast_rays import RayTable, ray_table
 from fieldstone.field.fast_step_numba import chunk_step
-from fieldstone.field.fast_workspace import Workspace, workspace
+from fieldstone.field.fast_terms_numba import PointRays, Terms
+from fieldstone.field.fast_update import move_grid, step_decoder
+from fieldstone.field.fast_workspace import RAYS_PER_KNOWN, Workspace, workspace
+from fieldstone.field.free_space import carve_free_space
+from fieldstone.field.known_points import known_rays, no_known_rays
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
 from fieldstone.field.occupancy_numba import used_cells
 from fieldstone.field.projection import Projection, no_projection, projection_for
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport
-from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage
+from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.geometry.rigid3 import Rigid3
 
 logger = logging.getLogger(__name__)
 
-EPSILON = np.float32(1e-8)
-DECODER_MEMORY = (0.9, 0.99)
 CELL_VERTICES = 2
 """An occupancy cell is this many cells of the finest level wide."""
 
@@ -52,6 +54,9 @@ PRUNE_AT = (0.25, 0.6)
 
 START_WEIGHTS = 1.2
 """The fog of the start weighs at least this many times `FastPlan.min_weight` in every sample."""
+
+FOG = 1.2
+"""Cells with less than this many times the density of the start are what no ray has asked for."""
 
 MIN_STEPS = 60
 """No cell is given up before so many steps."""
@@ -62,8 +67,8 @@ NEAR_SHARE = 0.5
 HULL_CELLS = 96
 """Cells of the visual hull along the longest side of the box."""
 
-SPLITS = 8
-"""Pieces of the table that `step_touched` is split into."""
+FREE_CELLS = 64
+"""Cells of an open scene along the longest side, before training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +86,8 @@ class FastState:
     """Mean squared gradient of each value of the grid."""
     decoder_mean: Decoder
     decoder_square: Decoder
+    exposure: Exposure
+    """Of every photo; all 1 unless the plan says that they are learned."""
     workspace: Workspace
     """Room for the next step; follows from the rest."""
 
@@ -90,6 +97,10 @@ class FastTraining:
     """Trains a fast field on a table of rays; a `FieldTraining`."""
 
     rays: RayTable
+    known: RayTable
+    """Rays to known points; may be none."""
+    points: PointRays
+    """Those points."""
     frame: FieldFrame
     occupancy: Occupancy
     """Where something may be, before training."""
@@ -120,8 +131,16 @@ class FastTraining:
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
         rays = np.full(plan.num_chunks, plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))
-        velocity = np.zeros_like(table)
-        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, workspace(field, plan))
+        velocity, exposure = np.zeros_like(table), unit_exposure(self.num_images)
+        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, exposure, self._workspace(field, plan))
+
+    @property
+    def num_images(self) -> int:
+        """Number of training photos."""
+        return len(self.rays.centers)
+
+    def _workspace(self, field: FastField, plan: FastPlan) -> Workspace:
+        return workspace(field, plan, self.num_images)
 
     def step(self, state: FastState, /) -> tuple[FastState, StepReport]:
         """One step; grids and occupancy change at the steps that the plan says."""
@@ -129,13 +148,19 @@ class FastTraining:
         plan = state.plan
         share = plan.rate_share(state.step)
         starts = state.cursor + np.concatenate([[0], np.cumsum(state.chunk_rays)])
-        found = self._gradients(state, starts)
+        found = self._gradients(state, starts, share)
         counts = np.array([samples for _, samples, _, _ in found], dtype=np.int64)
-        self._move_grid(state, counts, share)
-        _adam(state.field.decoder, state, np.float32(plan.decoder_rate * share))
+        move_grid(state.field, state.velocity, plan, state.workspace, counts, share, self.executor)
+        decoder, gradients = state.field.decoder, [chunk.gradient for chunk in state.workspace.chunks]
+        moments = (state.decoder_mean, state.decoder_square)
+        step_decoder(decoder, *moments, gradients, state.step + 1, np.float32(plan.decoder_rate * share))
+        if plan.exposure_rate > 0:
+            gradients = [chunk.gain_gradient for chunk in state.workspace.chunks]
+            step_exposure(state.exposure, gradients, state.step + 1, plan.exposure_rate * share)
         rays = np.array([rays for rays, _, _, _ in found], dtype=np.int64)
         loss = sum(squared for _, _, _, squared in found)
         mse = loss / (3.0 * max(int(rays.sum()), 1))
+        rays = np.maximum(rays - self._num_known(state), 1)
         state = replace(
             state,
             step=state.step + 1,
@@ -144,50 +169,27 @@ class FastTraining:
         )
         return state, StepReport(loss=mse, mse=mse)
 
-    def _gradients(self, state: FastState, starts: np.ndarray) -> list[tuple[int, int, int, float]]:
-        field, room = state.field, state.workspace
+    def _num_known(self, state: FastState) -> Int[np.ndarray, "c"]:
+        """Rays to known points that each chunk draws."""
+        use = state.plan.point_weight > 0 and len(self.known.image) > 0
+        return state.chunk_rays // RAYS_PER_KNOWN * int(use)
+
+    def _gradients(self, state: FastState, starts: np.ndarray, share: float) -> list[tuple[int, int, int, float]]:
+        field, room, plan = state.field, state.workspace, state.plan
         transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
         background = self.frame.background.astype(np.float32)
+        gains, terms = gains_of(state.exposure), Terms(np.float32(plan.sparsity), np.float32(plan.point_weight * share))
+        num_known = self._num_known(state)
 
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
-                self.rays, self.projection, int(starts[c]), int(state.chunk_rays[c]), self.seed, background,
-                room.grid, room.box, room.march, FOREVER, np.float32(state.plan.sparsity), field.decoder, transposed,
-                field.width, room.chunks[c],
+                self.rays, int(starts[c]), int(state.chunk_rays[c]), self.known, self.points,
+                int(starts[c]) // RAYS_PER_KNOWN, int(num_known[c]), self.projection, gains, self.seed, background,
+                room.grid, room.box, room.march, FOREVER, terms, field.decoder, transposed, field.width,
+                room.chunks[c],
             )  # fmt: skip
 
         return list(self.executor.map(chunk, range(len(room.chunks))))
-
-    def _move_grid(self, state: FastState, counts: np.ndarray, share: float) -> None:
-        field, velocity, plan, room = state.field, state.velocity, state.plan, state.workspace
-        rates = np.full(8, plan.feature_rate * share, dtype=np.float32)
-        rates[[0, CHANNELS]] = plan.density_rate * share
-        decay = np.float32(plan.decay)
-        levels = field.layout.num_levels
-        first_immediate = max(levels - plan.immediate_levels, 0)
-
-        def add(piece: tuple[int, int]) -> None:
-            level, half = piece
-            arguments = (
-                room.grid, level, half, counts, plan.samples_per_chunk, room.samples.position, room.samples.features,
-                field.width,
-            )  # fmt: skip
-            if level < first_immediate:
-                add_gradient(*arguments, room.gradient, room.touched)
-            else:
-                step_by_sample(*arguments, velocity, rates, decay, EPSILON)
-
-        list(self.executor.map(add, [(level, half) for level in reversed(range(levels)) for half in (0, 1)]))
-        words = len(room.touched) // 8
-        bounds = [8 * (words * piece // SPLITS) for piece in range(SPLITS + 1)]
-
-        def move(piece: int) -> None:
-            step_touched(
-                field.table, velocity, room.gradient, room.touched, bounds[piece], bounds[piece + 1], rates, decay,
-                EPSILON,
-            )  # fmt: skip
-
-        list(self.executor.map(move, range(SPLITS)))
 
     def _scheduled(self, state: FastState) -> FastState:
         """Grow the grid at the first step of a stage, and give up empty cells when it is time."""
@@ -197,14 +199,15 @@ class FastTraining:
         prune = into_stage == 0 and stage > 0
         prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
         if prune and state.step >= MIN_STEPS:
-            field = self._pruned(state.field, plan.prune_density)
+            fog = FOG * math.exp(state.field.raw_offset) if stage >= plan.clear_fog_from else 0.0
+            field = self._pruned(state.field, max(plan.prune_density, fog))
             state = replace(state, field=field, workspace=replace(state.workspace, box=field.box()))
         if plan.scout and stage == 1 and into_stage == 0:
             found = self._first_state(plan, state.field.occupancy.trimmed(), stage=1)
             return replace(found, step=state.step, cursor=state.cursor)
         wanted = plan.levels(stage)
         if wanted != state.field.layout.resolutions:
-            state = _grown(state, wanted)
+            state = _grown(state, wanted, self.num_images)
         return state
 
     def _pruned(self, field: FastField, density: float) -> FastField:
@@ -247,7 +250,7 @@ class FastTraining:
         for name in Decoder._fields:
             tensors[f"mean_{name}"] = getattr(state.decoder_mean, name)
             tensors[f"square_{name}"] = getattr(state.decoder_square, name)
-        return tensors
+        return tensors | {f"exposure_{name}": value for name, value in state.exposure._asdict().items()}
 
     def from_tensors(self, tensors: Mapping[str, np.ndarray], /) -> FastState:
         """The state of a checkpoint.
@@ -263,7 +266,9 @@ class FastTraining:
             square = Decoder(*(tensors[f"square_{name}"].copy() for name in Decoder._fields))
             step, cursor = int(tensors["step"]), int(tensors["cursor"])
             rays = tensors["chunk_rays"].copy()
-            return FastState(plan, step, cursor, rays, field, velocity, mean, square, workspace(field, plan))
+            exposure = Exposure(*(tensors[f"exposure_{name}"].copy() for name in Exposure._fields))
+            room = self._workspace(field, plan)
+            return FastState(plan, step, cursor, rays, field, velocity, mean, square, exposure, room)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"this checkpoint cannot be resumed ({error}); delete it and train again") from error
 
@@ -281,6 +286,7 @@ def fast_training(
     executor: Executor,
     use_alpha: bool = True,
     points_in_world: Float[np.ndarray, "p 3"] | None = None,
+    seen: Mapping[str, SeenPoints] | None = None,
     bounded: bool = True,
 ) -> FastTraining:
     """The training of a fast field on posed photos.
@@ -291,6 +297,7 @@ def fast_training(
 
     Args:
         points_in_world: Known points, which tell how near things are.
+        seen: What each photo is known to see.
         bounded: Nothing lies beyond the box.
         use_alpha: False takes photos with alpha as photos on the background of the frame.
 
@@ -302,7 +309,7 @@ def fast_training(
     unbounded = not bounded and projected is None
     reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
     projection, bounds = projected or (no_projection(), np.array([[-reach] * 3, [reach] * 3]))
-    occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2)
+    occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2 if bounded else FREE_CELLS)
     if use_alpha and bounded and all(image.pixels.shape[2] == 4 for image in images):
         masks = [image.pixels[:, :, 3] > 0 for image in images]
         if not any(mask.any() for mask in masks):
@@ -316,9 +323,13 @@ def fast_training(
                 "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
                 "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
             )
+    if seen:
+        occupancy = carve_free_space(occupancy, images, frame, seen, projection, executor, unbounded=unbounded)
+        logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
     all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
-    return FastTraining(table, frame, occupancy, unbounded, projection, plan, seed, executor)
+    known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
+    return FastTraining(table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor)
 
 
 def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
@@ -333,27 +344,7 @@ def _next_rays(rays: Int[np.ndarray, "c"], samples: Int[np.ndarray, "c"], room: 
     return np.clip((1.25 * rays * room / np.maximum(samples, 1)).astype(np.int64), room // 64, room)
 
 
-def _adam(decoder: Decoder, state: FastState, rate: np.float32) -> None:
-    """One Adam step of the decoder with the gradients of all chunks, added in their order.
-
-    Source:
-        `kingma2015`, algorithm 1.
-    """
-    memory, square_memory = (np.float32(m) for m in DECODER_MEMORY)
-    count = state.step + 1
-    first = np.float32(1.0 - DECODER_MEMORY[0] ** count)
-    second = np.float32(1.0 - DECODER_MEMORY[1] ** count)
-    for name in Decoder._fields:
-        gradient = np.zeros_like(getattr(decoder, name))
-        for chunk in state.workspace.chunks:
-            gradient += getattr(chunk.gradient, name)
-        mean, square = getattr(state.decoder_mean, name), getattr(state.decoder_square, name)
-        mean[:] = memory * mean + (1 - memory) * gradient
-        square[:] = square_memory * square + (1 - square_memory) * gradient * gradient
-        getattr(decoder, name)[:] -= rate * (mean / first) / (np.sqrt(square / second) + EPSILON)
-
-
-def _grown(state: FastState, resolutions: tuple[int, ...]) -> FastState:
+def _grown(state: FastState, resolutions: tuple[int, ...], num_images: int) -> FastState:
     """The same field on more levels: old levels keep their values, new ones start at 0."""
     old = state.field.layout
     new = grid_layout(old.extent, resolutions)
@@ -363,4 +354,4 @@ def _grown(state: FastState, resolutions: tuple[int, ...]) -> FastState:
         new.level(table, target)[:] = old.level(state.field.table, level)
         new.level(velocity, target)[:] = old.level(state.velocity, level)
     field = replace(state.field, layout=new, table=table)
-    return replace(state, field=field, velocity=velocity, workspace=workspace(field, state.plan))
+    return replace(state, field=field, velocity=velocity, workspace=workspace(field, state.plan, num_images))

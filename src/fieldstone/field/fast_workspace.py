@@ -15,6 +15,9 @@ from fieldstone.field.fast_march_numba import Box, March, Samples
 from fieldstone.field.fast_plan import FastPlan
 from fieldstone.field.fast_step_numba import Chunk, RayBatch, Work
 
+RAYS_PER_KNOWN = 8
+"""A chunk draws one ray with a known point for so many others."""
+
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
@@ -33,12 +36,12 @@ class Workspace:
     """Which blocks of `gradient` are not 0."""
 
 
-def workspace(field: FastField, plan: FastPlan) -> Workspace:
-    """Room for the steps of a plan on a field."""
+def workspace(field: FastField, plan: FastPlan, num_images: int) -> Workspace:
+    """Room for the steps of a plan on a field, with so many photos."""
     layout = field.layout
     room, width = plan.samples_per_chunk, field.width
     samples = room_for_samples(room * plan.num_chunks, width)
-    chunks = tuple(_chunk(samples, n, room, width, field.decoder) for n in range(plan.num_chunks))
+    chunks = tuple(_chunk(samples, n, room, width, field.decoder, num_images) for n in range(plan.num_chunks))
     num_gradients = int(layout.offsets[max(layout.num_levels - plan.immediate_levels, 0)])
     num_blocks = -(-num_gradients // (8 * BLOCK)) * 8
     return Workspace(
@@ -47,8 +50,8 @@ def workspace(field: FastField, plan: FastPlan) -> Workspace:
     )  # fmt: skip
 
 
-def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder) -> Chunk:
-    """Chunk n: its part of the samples, as many rays as samples at most, and its own decoder gradient."""
+def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder, num_images: int) -> Chunk:
+    """Chunk n: its part of the samples, as many rays as samples at most and those of known points, and gradients."""
 
     def floats(count: int) -> np.ndarray:
         return np.zeros(count, dtype=np.float32)
@@ -60,16 +63,14 @@ def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder) ->
         part(samples.position, 3), part(samples.distance, 1), part(samples.alpha, 1), part(samples.tau, 1),
         part(samples.light, 1), part(samples.ray, 1), part(samples.features, width),
     )  # fmt: skip
+    most = room + room // RAYS_PER_KNOWN
     rays = RayBatch(
-        floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(3 * room), floats(room),
-        np.zeros(room + 1, dtype=np.int64), floats(room),
+        floats(3 * most), floats(3 * most), floats(3 * most), floats(3 * most), floats(3 * most),
+        np.zeros(most, dtype=np.int32), floats(3 * most), np.zeros(most, dtype=np.int64), floats(most),
+        np.zeros(most + 1, dtype=np.int64), floats(most),
     )  # fmt: skip
     work = Work(
-        floats(room * HIDDEN),
-        floats(room * HIDDEN),
-        floats(room * HIDDEN),
-        floats(3 * room),
-        floats(3 * room),
-        floats(room),
-    )
-    return Chunk(rays, own, work, Decoder(*(np.zeros_like(weights) for weights in decoder)))
+        floats(most * HIDDEN), floats(most * HIDDEN), floats(room * HIDDEN), floats(3 * room), floats(3 * room),
+        floats(room), floats(room), floats(3 * most),
+    )  # fmt: skip
+    return Chunk(rays, own, work, Decoder(*(np.zeros_like(weights) for weights in decoder)), floats(3 * num_images))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.field.radiance_field import FieldFrame
@@ -35,6 +36,8 @@ class PosedImage:
     camera: Camera
     cam_from_world: Rigid3
     pixels: UInt8[np.ndarray, "h w c"]
+    keep: Bool[np.ndarray, "h w"] | None = None
+    """Pixels that say something of the scene; None: all."""
 
     def __post_init__(self) -> None:
         height, width, channels = self.pixels.shape
@@ -45,6 +48,8 @@ class PosedImage:
             )
         if channels not in (3, 4):
             raise InputError(f"{self.name}: a photo needs 3 (RGB) or 4 (RGBA) channels, got {channels}")
+        if self.keep is not None and self.keep.shape != (height, width):
+            raise InputError(f"{self.name}: its mask has {self.keep.shape[1]}x{self.keep.shape[0]} pixels")
 
     def composited(self, background: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 3"]:
         """Colours in [0, 1] over a background, in sRGB; float32."""
@@ -61,6 +66,14 @@ def composite_over(pixels: UInt8[np.ndarray, "*n c"], background: Float[np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Points in the world that one photo sees, and the standard deviations of their distances from it."""
+
+    xyz: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
 class RayDataset:
     """The photos that a field learns from, those held out, and the frame in which it learns."""
 
@@ -71,6 +84,8 @@ class RayDataset:
     """Triangulated points, none where only images and poses are known."""
     bounded: bool = True
     """Nothing lies beyond the cube of half side `NORMALIZED_RADIUS` around the origin of the frame."""
+    seen: Mapping[str, SeenPoints] = field(default_factory=dict)
+    """What each photo is known to see, by its name; may be empty."""
 
     def __post_init__(self) -> None:
         if not self.train:
@@ -145,7 +160,8 @@ def training_rays(images: tuple[PosedImage, ...], frame: FieldFrame) -> Training
 
     all_bearings = np.concatenate(bearings)
     bearing = np.concatenate(bearing_rows)
-    reached = np.all(np.isfinite(all_bearings), axis=1)[bearing]
+    kept = [np.ones(i.pixels.shape[:2], dtype=bool) if i.keep is None else i.keep for i in images]
+    reached = np.all(np.isfinite(all_bearings), axis=1)[bearing] & np.concatenate([k.reshape(-1) for k in kept])
     image_of = np.concatenate(image_rows)[reached]
     poses = Rigid3.stack([image.cam_from_world for image in images])
     normalized_from_world = frame.normalized_from_world
@@ -185,7 +201,9 @@ def reduce_image(image: PosedImage, max_size: int) -> PosedImage:
         mean_alpha = mean(alpha)
         pixels = np.concatenate([mean(rgb * alpha) / np.maximum(mean_alpha, 1e-9), mean_alpha], axis=2)
     pixels = np.rint(np.clip(pixels, 0.0, 255.0)).astype(np.uint8)
-    return PosedImage(image.name, rescale(image.camera, new_width, new_height), image.cam_from_world, pixels)
+    # A new pixel is kept if all that it covers is.
+    keep = None if image.keep is None else rows @ image.keep @ columns.T > 1.0 - 1e-6
+    return PosedImage(image.name, rescale(image.camera, new_width, new_height), image.cam_from_world, pixels, keep)
 
 
 def area_weights(size: int, new_size: int) -> Float[np.ndarray, "new_size size"]:
@@ -203,7 +221,7 @@ def reduce_images(images: tuple[PosedImage, ...], max_size: int) -> tuple[PosedI
     for image in images:
         small = reduce_image(image, max_size)
         camera = reduced_cameras.setdefault(id(image.camera), small.camera)
-        out.append(PosedImage(small.name, camera, small.cam_from_world, small.pixels))
+        out.append(replace(small, camera=camera))
     return tuple(out)
 
 
@@ -215,6 +233,17 @@ def split_every(names: list[str], every: int = TEST_EVERY) -> tuple[list[int], l
     order = sorted(range(len(names)), key=lambda i: names[i])
     test = order[::every] if len(names) > 1 else []
     return [i for i in order if i not in set(test)], test
+
+
+def poses_in_frame(
+    images: Sequence[PosedImage], frame: FieldFrame
+) -> tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 3"]]:
+    """Frame axes from camera axes, and centres, of every photo; float32."""
+    world = frame.normalized_from_world
+    poses = [image.cam_from_world for image in images]
+    rotations = np.stack([world.R @ pose.R.T for pose in poses]).astype(np.float32)
+    centers = np.stack([world.apply(pose.target_origin_in_source()) for pose in poses])
+    return rotations, centers.astype(np.float32)
 
 
 def blender_frame(near: float = BLENDER_NEAR, far: float = BLENDER_FAR) -> FieldFrame:

@@ -82,14 +82,20 @@ def packed_colors(
     Args:
         depth_scale: Optical depth of a sample at density 1.
     """
-    values = interpolate(field, points)
-    tau = torch.exp(values[:, :, 0].sum(dim=1) + field.raw_offset) * depth_scale
-    before = torch.cumsum(tau, dim=0) - tau
-    # The sum before the first sample of each ray is taken off, so that every ray starts anew.
-    starts = torch.searchsorted(ray, torch.arange(len(directions), device=ray.device, dtype=ray.dtype))
-    offset = torch.where(starts < len(ray), before[starts.clamp(max=len(ray) - 1)], before.new_zeros(()))
-    weights = torch.exp(offset[ray] - before) * -torch.expm1(-tau)
-    colors = decode(field, values, directions[ray])
+    weights = packed_weights(field, points, ray, len(directions), depth_scale)
+    colors = decode(field, interpolate(field, points), directions[ray])
     out = torch.zeros_like(background).index_add(0, ray, weights[:, None] * colors)
     opacity = torch.zeros_like(background[:, 0]).index_add(0, ray, weights)
     return out + (1.0 - opacity)[:, None] * background
+
+
+def packed_weights(
+    field: TorchFastField, points: Float[Tensor, "n 3"], ray: Int[Tensor, "n"], num_rays: int, depth_scale: float
+) -> Float[Tensor, "n"]:
+    """Share of the light of its ray that ends in each packed sample; arguments as of `packed_colors`."""
+    tau = torch.exp(interpolate(field, points)[:, :, 0].sum(dim=1) + field.raw_offset) * depth_scale
+    before = torch.cumsum(tau, dim=0) - tau
+    # The sum before the first sample of each ray is taken off, so that every ray starts anew.
+    starts = torch.searchsorted(ray, torch.arange(num_rays, device=ray.device, dtype=ray.dtype))
+    offset = torch.where(starts < len(ray), before[starts.clamp(max=len(ray) - 1)], before.new_zeros(()))
+    return torch.exp(offset[ray] - before) * -torch.expm1(-tau)

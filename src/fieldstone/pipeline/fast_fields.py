@@ -20,6 +20,7 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
+from fieldstone.field.fast_exposure import gain_at
 from fieldstone.field.fast_plan import (
     STAGE_SHARES,
     FastPlan,
@@ -39,7 +40,7 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.photos import write_photo
-from fieldstone.pipeline.field_input import dataset_of, open_field_input, read_images
+from fieldstone.pipeline.field_input import dataset_of, open_field_input, read_images, with_masks
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
     CURVE,
@@ -82,6 +83,8 @@ def train_fast_run(
     seed: int = 0,
     threads: int | None = None,
     photos: Path | None = None,
+    masks: Path | None = None,
+    size_px: int = MAX_SIZE_PX,
     on_step: OnStep = lambda point: None,
     on_stage: Callable[[str], None] = lambda stage: None,
 ) -> dict[str, Any]:
@@ -97,6 +100,8 @@ def train_fast_run(
         plan: The plan.json of another run, to be followed to the letter; the budget is then ignored.
         use_alpha: False takes photos with alpha as photos on the background.
         memory_gib: What grids and rays may take; the finest grid is chosen to fit.
+        masks: Folder with masks of the photos; nothing is learned where they are black, nor measured.
+        size_px: Photos are reduced to this length of their longer side.
 
     Returns:
         What `metrics.json` holds.
@@ -113,8 +118,8 @@ def train_fast_run(
         compile_kernels(executor)
         started = time.perf_counter()
         on_stage("reading photos")
-        given_photos = open_field_input(source, photos)
-        dataset = dataset_of(given_photos, MAX_SIZE_PX, held_out=False)
+        given_photos = with_masks(open_field_input(source, photos), masks)
+        dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         training = _open(dataset, given, budget_s, use_alpha, seed, executor, memory_gib)
         resumed = (out / CHECKPOINT).exists()
@@ -143,8 +148,9 @@ def train_fast_run(
         )
         elapsed = time.perf_counter() - started
         on_stage("rendering held-out views")
-        dataset = replace(dataset, test=read_images(given_photos.test, MAX_SIZE_PX))
-        metrics = evaluate_views(in_world(training.renderer(state), dataset.frame), dataset, out / "renders" / "test")
+        dataset = replace(dataset, test=read_images(given_photos.test, size_px))
+        shown = in_world(training.renderer(state), dataset.frame)
+        metrics = evaluate_views(shown, dataset, out / "renders" / "test", exposure_near(dataset, state))
     metrics |= {
         "seconds": elapsed,
         "steps": state.step,
@@ -159,6 +165,15 @@ def train_fast_run(
     write_json(out / METRICS, metrics)
     write_field_report(out, dataset, curve, metrics)
     return metrics
+
+
+def exposure_near(dataset: RayDataset, state: FastState) -> Callable[[PosedImage], np.ndarray] | None:
+    """The exposure that a held-out view is shown with, from the training photos near it; None: none was learned."""
+    if state.plan.exposure_rate == 0:
+        return None
+    log_gain = state.exposure.log_gain.astype(np.float64).reshape(-1, 3)
+    poses = Rigid3.stack([image.cam_from_world for image in dataset.train])
+    return lambda image: gain_at(log_gain, image.cam_from_world, poses)
 
 
 def train_stages(
@@ -261,6 +276,7 @@ def _open(
         executor=executor,
         use_alpha=use_alpha,
         points_in_world=dataset.points_in_world,
+        seen=dataset.seen,
         bounded=dataset.bounded,
     )
     if given is not None:

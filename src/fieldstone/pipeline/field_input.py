@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from fieldstone.errors import InputError
+from fieldstone.field.known_points import seen_points
 from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import (
     PosedImage,
     RayDataset,
+    SeenPoints,
     blender_frame,
     default_background,
     frame_around,
@@ -29,6 +31,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender
 from fieldstone.io.colmap import find_colmap_model, read_colmap
 from fieldstone.io.llff import is_llff_folder, read_llff
+from fieldstone.io.masks import find_masks, read_mask
 from fieldstone.io.photos import Photo, read_photo
 from fieldstone.io.posed_photos import PosedPhoto, PosedScene
 from fieldstone.io.transforms_json import find_transforms, read_transforms
@@ -60,6 +63,8 @@ class FieldInput:
     frame: FieldFrame | None
     """None: depends on whether the photos have alpha, and on the cameras alone."""
     bounded: bool
+    seen: Mapping[str, SeenPoints] = field(default_factory=dict)
+    """What each photo is known to see, by its name."""
 
 
 def read_ray_dataset(source: Path, photos: Path | None, image_size_px: int, *, held_out: bool = True) -> RayDataset:
@@ -95,7 +100,23 @@ def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) 
         frame.near,
         frame.far,
     )
-    return RayDataset(train, test, frame, given.points_in_world, bounded)
+    return RayDataset(train, test, frame, given.points_in_world, bounded, given.seen)
+
+
+def with_masks(given: FieldInput, masks: Path | None) -> FieldInput:
+    """The input with the masks of a folder, see `io.masks.find_masks`; None: as it is.
+
+    Raises:
+        InputError: No such folder, no mask for any photo, or a mask of another size than its photo.
+    """
+    if masks is None:
+        return given
+    found = find_masks(masks, [photo.path for photo in (*given.train, *given.test)])
+
+    def masked(photos: Sequence[PosedPhoto]) -> tuple[PosedPhoto, ...]:
+        return tuple(replace(photo, mask=found.get(photo.path)) for photo in photos)
+
+    return replace(given, train=masked(given.train), test=masked(given.test))
 
 
 def open_field_input(source: Path, photos: Path | None = None) -> FieldInput:
@@ -128,7 +149,7 @@ def read_images(photos: Sequence[PosedPhoto], image_size_px: int) -> tuple[Posed
     """Decoded and reduced photos; those that cannot be read are left out with a warning.
 
     Raises:
-        InputError: A photo is too small, or does not have the size of its camera.
+        InputError: A photo is too small, or does not have the size of its camera or its mask.
     """
     images = []
     with ThreadPoolExecutor() as pool:
@@ -136,11 +157,12 @@ def read_images(photos: Sequence[PosedPhoto], image_size_px: int) -> tuple[Posed
         reading = [pool.submit(read_photo, photo.path) for photo in photos]
         for photo, found in zip(photos, reading, strict=True):
             try:
-                pixels = pixels_of(found.result())
+                decoded = found.result()
+                keep = None if photo.mask is None else read_mask(photo.mask, decoded.info)
             except InputError as error:
                 logger.warning("skipped %s", error)
                 continue
-            images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels))
+            images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels_of(decoded), keep))
     reduced = reduce_images(tuple(images), image_size_px)
     for image in reduced:
         if min(image.pixels.shape[:2]) < MIN_SIDE_PX:
@@ -235,6 +257,7 @@ def _colmap_input(source: Path, photos: Path | None) -> FieldInput:
         model.points.xyz,
         frame_from_points(model, UNKNOWN),
         bounded=False,
+        seen=seen_points(model),
     )
 
 

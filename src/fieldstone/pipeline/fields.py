@@ -138,18 +138,34 @@ def open_training(
         yield TorchTraining(options, frame, rays, seed, torch_device(device), workers)
 
 
-def evaluate_views(render_rays: RayRenderer, dataset: RayDataset, folder: Path) -> dict[str, Any]:
-    """Render every held-out view to `folder`/NAME.png, and compare it with its photo."""
+def evaluate_views(
+    render_rays: RayRenderer,
+    dataset: RayDataset,
+    folder: Path,
+    exposure: Callable[[PosedImage], np.ndarray] | None = None,
+) -> dict[str, Any]:
+    """Render every held-out view to `folder`/NAME.png, and compare it with its photo, where its mask is white.
+
+    Args:
+        exposure: Gain of each channel with which a view is shown; None: 1.
+    """
     views: dict[str, dict[str, float]] = {}
     labels = view_labels([image.name for image in dataset.test])
     for label, image in zip(labels, dataset.test, strict=True):
-        rendered = quantize(render_view(render_rays, image.camera, image.cam_from_world).rgb)
+        color = render_view(render_rays, image.camera, image.cam_from_world).rgb
+        rendered = quantize(color if exposure is None else color * exposure(image))
         write_photo(folder / f"{label}.png", rendered)
         photo = image.composited(dataset.frame.background)
         as_written = rendered.astype(np.float32) / np.float32(255.0)
-        views[label] = {"psnr": min(psnr(as_written, photo), MAX_PSNR), "ssim": ssim(as_written, photo)}
+        if image.keep is not None:
+            as_written = np.where(image.keep[..., None], as_written, photo)
+        share = 1.0 if image.keep is None else max(float(image.keep.mean()), 1e-9)
+        # Equal pixels where the mask is black count nothing: the mean is over the others.
+        found = psnr(as_written, photo) + 10.0 * np.log10(share)
+        views[label] = {"psnr": min(found, MAX_PSNR), "ssim": ssim(as_written, photo)}
     sizes = sorted({(image.camera.width, image.camera.height) for image in dataset.test})
     background = ", ".join(f"{255 * c:.0f}" for c in dataset.frame.background)
+    masked = any(image.keep is not None for image in dataset.test)
     return {
         "psnr": float(np.mean([view["psnr"] for view in views.values()])) if views else None,
         "ssim": float(np.mean([view["ssim"] for view in views.values()])) if views else None,
@@ -157,6 +173,8 @@ def evaluate_views(render_rays: RayRenderer, dataset: RayDataset, folder: Path) 
         "protocol": (
             f"{len(views)} held-out views of {' and '.join(f'{w}x{h}' for w, h in sizes) or 'no'} pixels; "
             f"background ({background}); {PROTOCOL}; equal images count as {MAX_PSNR:.0f} dB"
+            + ("" if exposure is None else "; shown with the exposure of the training photos nearest to them")
+            + ("; only where masks are white" if masked else "")
         ),
     }
 
@@ -210,7 +228,11 @@ def fingerprint(dataset: RayDataset) -> str:
     digest = hashlib.sha256()
     for image in dataset.train:
         digest.update(f"{image.name}\n{image.pixels.shape}\n".encode())
-        for array in (image.pixels, image.camera.params, image.cam_from_world.R, image.cam_from_world.t):
+        arrays = [image.pixels, image.camera.params, image.cam_from_world.R, image.cam_from_world.t]
+        seen = dataset.seen.get(image.name)
+        arrays += [] if image.keep is None else [image.keep]
+        arrays += [] if seen is None else [seen.xyz, seen.sigma]
+        for array in arrays:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

@@ -1,0 +1,105 @@
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from fast_scenes import CAMERA, FRAME
+from fieldstone.field.free_space import carve_free_space, corners_in_world
+from fieldstone.field.occupancy import full_box
+from fieldstone.field.projection import no_projection, project_points, projection_for
+from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.geometry.camera import image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+
+PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+WALL = 4.0
+WORKER = ThreadPoolExecutor(1)
+
+
+def wall_scene(count):
+    """Cameras side by side before a wall at z = 4, and what they see of it."""
+    rng = np.random.default_rng(0)
+    images, seen = [], {}
+    for k in range(count):
+        pose = Rigid3(np.eye(3), np.array([0.05 * k, 0.0, 0.0]))
+        images.append(PosedImage(f"{k}", CAMERA, pose, PIXELS))
+        wall = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.full(4000, WALL)])
+        pixels = image_from_cam(CAMERA, pose.apply(wall))
+        inside = np.all((pixels > 0) & (pixels < [CAMERA.width, CAMERA.height]), axis=1)
+        seen[f"{k}"] = SeenPoints(wall[inside], np.full(np.count_nonzero(inside), 0.01))
+    return images, seen
+
+
+def box(unbounded):
+    reach = NORMALIZED_RADIUS * (2 if unbounded else 1)
+    return full_box(np.full(3, -reach), np.full(3, 2 * reach), 48)
+
+
+def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
+    images, seen = wall_scene(3)
+    start = box(True)
+    carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
+    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    near, far = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
+    # Cells that hold a point of the wall are kept.
+    for points in seen.values():
+        for x in points.xyz[:50]:
+            x = 0.999 * x  # beside the plane that cells share, in the cells before it
+            holds = ((near <= x) & (x <= far)).all(axis=-1)
+            assert carved.cells[holds].all()
+    # A cell in front of all cameras, well before the wall, is free; one behind them is not.
+    with np.errstate(invalid="ignore"):
+        middle = np.nan_to_num(0.5 * (near + far), nan=1e9)
+    before = np.argmin(np.linalg.norm(middle - [0.0, 0.0, 1.5], axis=-1))
+    behind = np.argmin(np.linalg.norm(middle - [0.0, 0.0, -1.0], axis=-1))
+    assert not carved.cells.reshape(-1)[before]
+    assert carved.cells.reshape(-1)[behind]
+
+
+def test_photos_without_points_carve_nothing():
+    images, _ = wall_scene(2)
+    start = box(True)
+    few = {"0": SeenPoints(np.array([[0.0, 0, WALL]]), np.array([0.01]))}
+    carved = carve_free_space(start, images, FRAME, few, no_projection(), WORKER, unbounded=True)
+    np.testing.assert_array_equal(carved.cells, start.cells)
+
+
+def test_what_too_few_photos_see_from_near_is_not_there():
+    """A ninth photo that looks elsewhere: nothing stands where it alone sees near places."""
+    images, seen = wall_scene(9)
+    aside = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    images[-1] = PosedImage("8", CAMERA, aside, PIXELS)
+    seen["8"] = SeenPoints(aside.inverse().apply(seen["0"].xyz), seen["0"].sigma)
+    start = box(True)
+    carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
+    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    behind = np.linalg.norm(np.nan_to_num(corners[:-1, :-1, :-1], nan=1e9) - [0.0, 0.0, -0.95 * WALL], axis=-1)
+    assert not carved.cells.reshape(-1)[np.argmin(behind)]
+    beyond = np.linalg.norm(np.nan_to_num(corners[:-1, :-1, :-1], nan=1e9) - [0.0, 0.0, -2.0 * WALL], axis=-1)
+    assert carved.cells.reshape(-1)[np.argmin(beyond)]
+
+
+@pytest.mark.parametrize("projected", [False, True])
+def test_corners_come_back_to_the_grid(projected):
+    """The corners, put back into the space of the grid, lie on the grid; infinity is nan."""
+    images, seen = wall_scene(3)
+    projection, start = no_projection(), box(True)
+    if projected:
+        found = projection_for(images, FRAME, seen["0"].xyz)
+        assert found is not None
+        projection, bounds = found
+        start = full_box(bounds[0], bounds[1] - bounds[0], 16)
+    corners = corners_in_world(start, FRAME, projection, unbounded=not projected)
+    grid = start.lower + start.cell_size * np.stack(
+        np.meshgrid(*(np.arange(n) for n in corners.shape[:3]), indexing="ij"), axis=-1
+    )
+    finite = np.isfinite(corners).all(axis=-1)
+    assert 0.5 < finite.mean() <= 1.0
+    if projected:
+        finite &= corners[..., 2] < 1e3
+        again = project_points(projection, corners[finite])
+    else:
+        x = corners[finite] / NORMALIZED_RADIUS
+        m = np.abs(x).max(axis=1, keepdims=True)
+        again = NORMALIZED_RADIUS * np.where(m > 1, (2 - 1 / np.maximum(m, 1)) / np.maximum(m, 1), 1.0) * x
+    np.testing.assert_allclose(again, grid[finite], atol=1e-5)

@@ -1,0 +1,131 @@
+"""Training with all that real scenes need: known points, exposures, free space, masks, distortion."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
+from fieldstone.evaluate.image_metrics import psnr
+from fieldstone.field.fast_field import occupancy_box
+from fieldstone.field.fast_plan import FastPlan
+from fieldstone.field.fast_rays import ray_table
+from fieldstone.field.fast_training import FastTraining, fast_training
+from fieldstone.field.occupancy import full_box
+from fieldstone.field.ray_dataset import PosedImage, SeenPoints
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.scene.rays import rays_from_view
+
+PLAN = FastPlan(
+    finest=32, steps=(20, 20, 20, 20, 20, 10, 5, 5), num_chunks=4, samples_per_chunk=512, scout=False, raw_offset=-3.0,
+    prune_density=0.01, min_weight=4e-3, clear_fog_from=4, exposure_rate=0.03, point_weight=0.1,
+)  # fmt: skip
+
+GAINS = 1.0 + 0.25 * np.cos(2.0 * np.arange(20))
+
+
+def photographed(seed=0):
+    """The ball before black, every photo with another exposure, and points on it that each photo sees."""
+    rng = np.random.default_rng(seed)
+    images, seen = [], {}
+    for gain, image in zip(GAINS, ball_images(20), strict=True):
+        rgb = np.where(image.pixels[..., 3:] > 127, image.pixels[..., :3], 0) * 0.7 * gain
+        images.append(replace(image, pixels=np.rint(rgb).astype(np.uint8)))
+        center = image.cam_from_world.target_origin_in_source()
+        p = rng.normal(size=(200, 3))
+        p *= RADIUS / np.linalg.norm(p, axis=1, keepdims=True)
+        facing = p[np.einsum("ni,ni->n", p, center - p) > 0.3]
+        seen[image.name] = SeenPoints(facing, np.full(len(facing), 0.01))
+    return tuple(images), seen
+
+
+def training(executor, images, seen, plan=PLAN) -> FastTraining:
+    points = np.concatenate([points.xyz for points in seen.values()])
+    dark = replace(FRAME, background=np.zeros(3))
+    return fast_training(
+        images, dark, plan, seed=0, executor=executor, points_in_world=points, seen=seen, bounded=False
+    )
+
+
+def run(work, state, steps):
+    for _ in range(steps):
+        state, _ = work.step(state)
+    return state
+
+
+def same_tensors(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def test_neither_threads_nor_a_stop_change_a_bit():
+    images, seen = photographed()
+    results = []
+    for threads in (1, 2):
+        with ThreadPoolExecutor(threads) as executor:
+            work = training(executor, images, seen)
+            state = run(work, work.start(), 45)
+            if threads == 2:
+                saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
+                state = work.from_tensors(saved)
+            results.append(work.to_tensors(run(work, state, PLAN.total_steps - 45)))
+    same_tensors(*results)
+    assert np.any(results[0]["exposure_log_gain"] != 0)
+
+
+def test_the_exposures_of_photos_are_told_from_the_colours_of_the_scene():
+    images, seen = photographed()
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor, images[1:], seen)
+        state = run(work, work.start(), PLAN.total_steps)
+        shown = work.renderer(state)(rays_from_view(CAMERA, images[0].cam_from_world)).rgb
+    found = np.exp(state.exposure.log_gain.reshape(-1, 3).mean(axis=1))
+    assert np.corrcoef(found, GAINS[1:])[0, 1] > 0.9
+    # With the mean exposure of all photos; the held-out one is 25 % brighter.
+    as_mean = np.rint(images[0].pixels / GAINS[0] * np.exp(np.log(GAINS[1:]).mean()))
+    assert psnr(shown.reshape(CAMERA.height, CAMERA.width, 3), as_mean / 255.0) > 22.0
+
+
+def test_what_masks_leave_out_is_not_learned():
+    """A wrong colour in a third of every photo does no harm under masks."""
+    images, _ = photographed()
+    masked = []
+    for image in images:
+        pixels, keep = image.pixels.copy(), np.ones((CAMERA.height, CAMERA.width), dtype=bool)
+        pixels[:, 26:] = (0, 255, 0)
+        keep[:, 26:] = False
+        masked.append(replace(image, pixels=pixels, keep=keep))
+    with ThreadPoolExecutor(1) as executor:
+        box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
+        rays = ray_table(tuple(masked), FRAME, occupancy_box(box, box.extent, True), executor)
+    assert len(rays.image) == len(images) * 26 * CAMERA.height
+    assert not np.any((rays.rgba[:, 1] == 255) & (rays.rgba[:, 0] == 0))
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [("OPENCV", [-0.2, 0.05, 0.002, -0.001]), ("OPENCV_FISHEYE", [0.05, -0.02, 0.003, 0.0]), ("SIMPLE_RADIAL", [0.1])],
+)
+def test_rays_of_distorted_photos_are_exact(model, lens):
+    """A point on any ray of the table is seen by the distorted camera in the middle of the pixel of that ray."""
+    focal = [45.0] if model == "SIMPLE_RADIAL" else [45.0, 44.0]
+    camera = Camera(model, 40, 32, np.array([*focal, 20.5, 15.5, *lens]))
+    images = tuple(
+        PosedImage(i.name, camera, i.cam_from_world, np.arange(40 * 32 * 3).reshape(32, 40, 3).astype(np.uint8))
+        for i in ball_images(3)
+    )
+    box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
+    with ThreadPoolExecutor(1) as executor:
+        table = ray_table(images, FRAME, occupancy_box(box, box.extent, True), executor)
+    d = np.einsum("nij,nj->ni", table.rotations[table.image], table.bearings[table.bearing]).astype(np.float64)
+    for v, image in enumerate(images):
+        rows = table.image == v
+        points = table.centers[v] + 3.0 * d[rows]
+        pixels = image_from_cam(camera, image.cam_from_world.apply(points))
+        expected = np.stack([table.bearing[rows] % 40 + 0.5, table.bearing[rows] // 40 + 0.5], axis=1)
+        # float32 rays: a few 1e-6 of the focal length.
+        np.testing.assert_allclose(pixels, expected, atol=1e-3)
+        shown = image.pixels.reshape(-1, 3)[table.bearing[rows]]
+        np.testing.assert_array_equal(table.rgba[rows, :3], shown)
