@@ -5,14 +5,18 @@ import pytest
 
 from fieldstone.evaluate.reconstruction_metrics import pairwise_pose_errors_deg
 from fieldstone.features.verification import verify_pairs
+from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp
 from fieldstone.mapping import ambiguity
 from fieldstone.mapping.ambiguity import contradictions, pairs_with_rotation, resolve_ambiguity
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.conflicts import find_conflicts
 from fieldstone.mapping.record import MappingRun
+from fieldstone.mapping.registration import contradicts_pairs
 from fieldstone.mapping.rotation_forest import tree_of_most_inliers
+from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.tracks import Observations
 from fieldstone.solve.two_view import TwoViewOptions
 from fieldstone.synthetic.symmetric import SymmetricOptions, SymmetricScene, synthesize_symmetric
 
@@ -51,6 +55,7 @@ def test_a_symmetric_building_with_surroundings_is_not_folded():
     assert run.notes[0].startswith("ambiguous scene")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_decided_is_split_and_told_of():
     scene, graph = ring(num_photos=32, unique_share=0.07, shuffled=True)
     run = map_ring(scene, graph)
@@ -68,11 +73,55 @@ def test_without_any_surroundings_the_order_of_the_photos_decides():
     assert "order" in run.notes[1]
 
 
+@pytest.mark.slow
 def test_without_surroundings_or_order_nothing_is_pretended():
     scene, graph = ring(unique_share=0.0, shuffled=True)
     run = map_ring(scene, graph)
     assert len(run.reconstruction.registered()) < 28
     assert "nothing tells true pairs from false ones" in run.notes[1]
+
+
+EXACT_RING = {"unevenness": 0.0, "jitter_deg": 0.0}
+OPEN_PATH = {"sweep_deg": 300.0}
+ALIKE = {"max_view_change_deg": 180.0}
+"""Sides that look the same from wherever they are seen: rotations of false pairs agree with each other."""
+
+
+@pytest.mark.parametrize("unique_share", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
+@pytest.mark.parametrize("view", [{}, *(pytest.param(v, marks=pytest.mark.slow) for v in (EXACT_RING, OPEN_PATH))])
+def test_sides_that_are_alike_from_everywhere_are_not_folded(unique_share, view):
+    scene, graph = ring(unique_share=unique_share, **ALIKE, **view)
+    run = map_ring(scene, graph)
+    assert sum(len(model.registered()) for model in (run.reconstruction, *run.others)) >= 26
+    assert max(worst_errors_deg(scene, run)) < 1.0
+    assert run.notes[0].startswith("ambiguous scene")
+
+
+@pytest.mark.parametrize(("unique_share", "registered"), [(0.1, 20), pytest.param(0.3, 28, marks=pytest.mark.slow)])
+def test_without_order_surroundings_split_sides_that_are_alike_from_everywhere(unique_share, registered):
+    scene, graph = ring(unique_share=unique_share, shuffled=True, **ALIKE)
+    run = map_ring(scene, graph)
+    assert sum(len(model.registered()) for model in (run.reconstruction, *run.others)) >= registered
+    assert max(worst_errors_deg(scene, run)) < 1.0
+    assert run.notes[0].startswith("ambiguous scene")
+
+
+@pytest.mark.slow
+def test_a_fold_that_nothing_tells_is_reported():
+    scene, graph = ring(unique_share=0.0, shuffled=True, **ALIKE)
+    run = map_ring(scene, graph)
+    assert max(worst_errors_deg(scene, run)) > 90.0
+    assert run.notes[0].startswith("ambiguous scene")
+
+
+def test_a_pose_that_the_photos_of_a_model_contradict_is_refused():
+    scene, graph = ring(sides_differ=True)
+    empty = WorkingModel.start(scene.truth.cameras, np.zeros(28, dtype=np.int64), Observations.empty())
+    model = empty.with_pose(3, scene.truth.pose_of(3)).with_pose(4, scene.truth.pose_of(4))
+    assert contradicts_pairs(model, graph, 5, scene.truth.pose_of(5)) == ""
+    turned = scene.truth.pose_of(5) @ Rigid3(exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
+    assert "ask for another rotation" in contradicts_pairs(model, graph, 5, turned)
+    assert "none of its photos" in contradicts_pairs(model, graph, 17, scene.truth.pose_of(17))
 
 
 def test_an_ordinary_ring_is_left_alone():
@@ -99,6 +148,7 @@ def test_an_ordinary_ring_loses_no_pair_even_if_it_is_suspected(monkeypatch):
         assert np.rad2deg(angle_between(pose.R, truth.pose_of(j).R @ truth.pose_of(i).R.T)) > 5
 
 
+@pytest.mark.slow
 def test_a_result_does_not_depend_on_the_order_of_the_pairs():
     scene, graph = ring(unique_share=0.1)
     backwards = MatchGraph(graph.names, graph.keypoints, graph.colors, dict(reversed(list(graph.matches.items()))))

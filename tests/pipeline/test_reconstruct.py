@@ -2,15 +2,20 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fieldstone.cli import main
+from fieldstone.evaluate.reconstruction_metrics import pairwise_pose_errors_deg
+from fieldstone.geometry.camera import Camera
 from fieldstone.io.colmap import read_colmap
-from fieldstone.scene.reconstruction import Reconstruction
+from fieldstone.scene.match_graph import MatchGraph
+from fieldstone.scene.reconstruction import Reconstruction, View
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
+from fieldstone.synthetic.symmetric import SymmetricOptions, synthesize_symmetric
 from matchers import assert_reconstruction_near
 from real_data import data_folder
 
@@ -19,13 +24,19 @@ def write_course_folder(folder: Path, *, matlab: bool = False, seed: int = 0) ->
     """A synthetic scene in the course format, without photos; returns the truth."""
     options = SceneOptions(num_cameras=4, num_points=150, layout="arc", noise_px=0.3, outlier_share=0.1)
     scene = synthesize(options, np.random.default_rng(seed))
-    graph, K = scene.graph, scene.truth.cameras[0].calibration_matrix()
+    write_course(scene.graph, scene.truth.cameras[0], folder, matlab=matlab)
+    return scene.truth
+
+
+def write_course(graph: MatchGraph, camera: Camera, folder: Path, *, matlab: bool = False) -> None:
+    """Matches in the course format; photo k of the graph is photo k + 1 of the folder."""
+    K = camera.calibration_matrix()
     K[:2, 2] -= 0.5
     rows = [" ".join(repr(float(x)) for x in row) for row in K]
     folder.mkdir(parents=True)
     text = f"K = [{'; '.join(rows)}];" if matlab else "\n".join(rows)
     (folder / "calibration.txt").write_text(text + "\n")
-    for i in range(3):
+    for i in range(graph.num_images - 1):
         lines = []
         for (a, b), matches in sorted(graph.matches.items()):
             if a == i:
@@ -37,7 +48,23 @@ def write_course_folder(folder: Path, *, matlab: bool = False, seed: int = 0) ->
                     lines.append(f"2 10 20 30 {place} {b + 1} {other} ")
         end = "\r\n" if matlab else "\n"
         (folder / f"matching{i + 1}.txt").write_bytes(end.join([f"nFeatures: {len(lines)}", *lines, ""]).encode())
-    return scene.truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("max_view_change_deg", [40.0, 180.0])
+def test_given_matches_of_a_symmetric_building_are_not_folded(tmp_path, max_view_change_deg):
+    options = SymmetricOptions(points_per_side=200, max_view_change_deg=max_view_change_deg)
+    scene = synthesize_symmetric(options, np.random.default_rng(0))
+    write_course(scene.graph, scene.truth.cameras[0], tmp_path / "scene")
+    assert main(["reconstruct", str(tmp_path / "scene"), "-o", str(tmp_path / "out")]) == 0
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert any("ambiguous scene" in note for note in record["notes"])
+    assert sum(record["components"]) >= 26
+    for k in range(len(record["components"])):
+        model = read_colmap(tmp_path / "out" / "sparse" / str(k))
+        views = tuple(View(f"photo_{int(Path(v.name).stem) - 1:04d}.png", 0, v.cam_from_world) for v in model.views)
+        errors = pairwise_pose_errors_deg(replace(model, views=views), scene.truth)
+        assert errors[np.isfinite(errors)].max() < 1.0
 
 
 @pytest.mark.parametrize("matlab", [False, True], ids=["plain, LF", "MATLAB, CRLF"])

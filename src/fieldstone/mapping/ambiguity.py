@@ -9,24 +9,22 @@ Trees are cut where their evidence is no better than that of pairs which contrad
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import bdtr
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.geometry.rotation import log
-from fieldstone.mapping.conflicts import Conflict, find_conflicts
+from fieldstone.geometry.rotation import exp, log
+from fieldstone.mapping.conflicts import find_conflicts
 from fieldstone.mapping.record import MappingRun
 from fieldstone.mapping.rotation_forest import (
     AGREE,
+    Evidence,
     Forest,
-    Missing,
     Pairs,
-    pooled,
+    misses_less,
     tree_of_least_conflict,
     tree_of_most_inliers,
     turn_angles,
@@ -43,13 +41,19 @@ CONTRADICTING_SHARE, CONTRADICTING_PAIRS = 0.02, 4
 """Share and number of strong pairs that have to contradict the others before anything is done."""
 MIN_GROUP = 2
 """A single pair may be wrong for many reasons; places that look alike give several that say the same."""
-FEATURES_PER_REGION = 4
-"""Features that are missing together count as one observation."""
-SIGNIFICANCE, CLEAR_RATIO = 0.01, 2.0
-"""How sure it is that one group of pairs misses less than another, and how much less."""
-SAME_TURN_SHARE = 0.9
+MIN_SAME, SAME_SHARE, MIN_SIDE = 4, 0.01, float(np.deg2rad(45.0))
+"""So many pairs, and such a share of all, cannot contradict the trees by the same turn of such a size by accident,
+however weak they are: it is that from one side of a building to another that looks like it."""
+SAME_TURN_SHARE = 0.75
 """Share of the steps from photo to photo, in their order, that go on turning the same way: taken while walking."""
 MIN_STEPS = 8
+WHAT_WOULD_HELP = (
+    "photos that also show what is around, or names in the order in which the photos were taken, would join them"
+)
+MIN_TURN, MAX_UNEVENNESS = float(np.deg2rad(2.0)), float(np.deg2rad(35.0))
+"""Of the steps: how far they turn at least, and how far from their mean; false pairs turn by a side more or less."""
+MAX_STEP = 3
+"""Photos that lie so near in their order are joined by pairs that turn as the steps do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,44 +79,88 @@ def resolve_ambiguity(
         inference.
     """
     pairs = pairs_with_rotation(graph)
+    nothing = Resolution(graph, (), np.zeros(graph.num_images, dtype=np.int64))
+    if not len(pairs):
+        return nothing
     count, strong = contradictions(pairs, tree_of_most_inliers(pairs, graph.num_images))
-    if not _too_many(count, strong):
-        return Resolution(graph, (), np.zeros(graph.num_images, dtype=np.int64))
-    found = find_conflicts(graph, cameras, camera_of_image)
-    conflicts = [found[pairs.pair(k)] for k in range(len(pairs))]
-    forest = tree_of_least_conflict(pairs, conflicts, graph.num_images)
-    forest, undecided = _review(forest, pairs, conflicts)
-    notes = [f"ambiguous scene: {count} of {strong} strong pairs contradict the others, places in it look alike"]
-    in_order = _in_order(pairs, graph.num_images) if undecided else None
-    if in_order is not None:
-        forest = in_order
-        notes.append(
-            "ambiguous scene: the photos alone do not tell the places apart; they were taken to be in the order of "
-            "their names, walking around it"
+    # Weak pairs matter only where strong ones leave photos apart, or if there is something to decide.
+    joined = tree_of_most_inliers(pairs.only_strong(), graph.num_images).root
+    wanted = {
+        pairs.pair(k) for k in np.flatnonzero(pairs.strong | (joined[pairs.first] != joined[pairs.second])).tolist()
+    }
+    evidence = Evidence.of(pairs, find_conflicts(graph, cameras, camera_of_image, wanted))
+    forest, doubted = tree_of_least_conflict(pairs, evidence, graph.num_images)
+    same = _most_alike(pairs, forest)
+    if _too_many(count, strong):
+        note = f"ambiguous scene: {count} of {strong} strong pairs contradict the others, places in it look alike"
+    elif doubted:
+        note = (
+            "ambiguous scene: places in it look alike, for photos that seem to be near each other share less than "
+            f"others that are further apart, such as {_names(graph, pairs, doubted)}"
         )
-    elif undecided:
-        forest = _cut(forest, pairs, undecided)
-        names = [" and ".join(graph.names[v] for v in pairs.pair(k)) for k in undecided[:3]]
-        notes.append(
-            f"ambiguous scene: cut at {len(undecided)} places where nothing tells true pairs from false ones, such as "
-            f"between {'; '.join(names)}: the parts are models of their own; photos that also show what is around, or "
-            "names in the order in which the photos were taken, would join them"
-        )
+    elif same >= max(MIN_SAME, SAME_SHARE * len(pairs)):
+        note = f"ambiguous scene: {same} pairs contradict the others by the same turn, places in it look alike"
+    else:
+        return nothing
+    evidence = Evidence.of(pairs, find_conflicts(graph, cameras, camera_of_image))
+    forest, doubted = tree_of_least_conflict(pairs, evidence, graph.num_images)
+    forest, undecided = _review(forest, pairs, evidence)
+    forest, notes = _decided(graph, pairs, forest, [*undecided, *doubted])
+    return _without_false_pairs(graph, pairs, forest, (note, *notes))
+
+
+def _decided(graph: MatchGraph, pairs: Pairs, forest: Forest, open_pairs: list[int]) -> tuple[Forest, list[str]]:
+    """The forest that the order of the photos tells, if it tells one that differs; else cut where pairs are open."""
+    order = _in_order(pairs, graph.num_images)
+    agreeing = forest.agreeing(pairs)
+    if order is not None and (
+        open_pairs or agreeing[order.against].any() or not agreeing[list(order.forest.tree)].all()
+    ):
+        note = "the photos alone do not tell the places apart; they were taken to be in the order of their names"
+        return order.forest, [f"ambiguous scene: {note}, walking around it"]
+    if open_pairs:
+        return _cut(forest, pairs, open_pairs), [
+            f"ambiguous scene: cut at {len(open_pairs)} places where nothing tells true pairs from false ones, such as "
+            f"between {_names(graph, pairs, open_pairs)}: the parts are models of their own; {WHAT_WOULD_HELP}"
+        ]
+    return forest, []
+
+
+def _without_false_pairs(graph: MatchGraph, pairs: Pairs, forest: Forest, notes: tuple[str, ...]) -> Resolution:
+    """The graph without the pairs that contradict the forest."""
     false = np.flatnonzero(~forest.agreeing(pairs))
     two_views, left_out = dict(graph.two_views), np.zeros(graph.num_images, dtype=np.int64)
     for k in false.tolist():
         two_views[pairs.pair(k)] = degenerate(len(graph.matches[pairs.pair(k)]))
         left_out[list(pairs.pair(k))] += 1
-    notes.append(f"ambiguous scene: {len(false)} of {len(pairs)} pairs were taken to be false and left out")
+    notes = (*notes, f"ambiguous scene: {len(false)} of {len(pairs)} pairs were taken to be false and left out")
     for note in notes:
         logger.warning("%s", note)
-    return Resolution(graph.with_two_views(two_views), tuple(notes), left_out)
+    return Resolution(graph.with_two_views(two_views), notes, left_out)
+
+
+def _names(graph: MatchGraph, pairs: Pairs, rows: Sequence[int]) -> str:
+    """The photos of the first few pairs."""
+    return "; ".join(" and ".join(graph.names[v] for v in pairs.pair(k)) for k in rows[:3])
+
+
+def _most_alike(pairs: Pairs, forest: Forest) -> int:
+    """Size of the largest group of pairs that contradict their tree by the same turn, one way or the other."""
+    inside = forest.root[pairs.first] == forest.root[pairs.second]
+    against = np.flatnonzero(inside & ~forest.agreeing(pairs))
+    steps = forest.steps(pairs, against)
+    steps = steps[turn_angles(steps) > MIN_SIDE]
+    best = 0
+    for step in steps:
+        alike = (turn_angles(steps @ step.T) < AGREE) | (turn_angles(steps @ step) < AGREE)
+        best = max(best, int(alike.sum()))
+    return best
 
 
 def pairs_with_rotation(graph: MatchGraph) -> Pairs:
     """All pairs that have a relative pose."""
     posed = [(p, v, v.cam2_from_cam1) for p, v in sorted(graph.two_views.items()) if v.inliers.any()]
-    posed = [(p, int(v.inliers.sum()), pose.R) for p, v, pose in posed if pose is not None and v.kind != "panoramic"]
+    posed = [(p, int(v.inliers.sum()), pose.R) for p, v, pose in posed if pose is not None]
     index = np.array([pair for pair, _, _ in posed], dtype=np.int64).reshape(-1, 2)
     inliers = np.array([count for _, count, _ in posed], dtype=np.int64)
     best = np.zeros(graph.num_images, dtype=np.int64)
@@ -163,22 +211,22 @@ def _too_many(count: int, strong: int) -> bool:
     return count >= max(CONTRADICTING_PAIRS, CONTRADICTING_SHARE * strong)
 
 
-def _review(forest: Forest, pairs: Pairs, conflicts: Sequence[Conflict]) -> tuple[Forest, list[int]]:
+def _review(forest: Forest, pairs: Pairs, evidence: Evidence) -> tuple[Forest, list[int]]:
     """Ask of every branch whether the pairs across it that contradict it have better evidence, and turn it if so.
 
     Returns:
         The forest, and the branches whose evidence is not clearly better than that against them.
     """
-    turned, undecided = _review_once(forest, pairs, conflicts)
+    turned, undecided = _review_once(forest, pairs, evidence)
     for _ in forest.tree:
         if turned is None:
             break
         forest = turned
-        turned, undecided = _review_once(forest, pairs, conflicts)
+        turned, undecided = _review_once(forest, pairs, evidence)
     return forest, undecided
 
 
-def _review_once(forest: Forest, pairs: Pairs, conflicts: Sequence[Conflict]) -> tuple[Forest | None, list[int]]:
+def _review_once(forest: Forest, pairs: Pairs, evidence: Evidence) -> tuple[Forest | None, list[int]]:
     undecided = []
     steps = forest.steps(pairs, np.arange(len(pairs)))
     for branch in reversed(forest.tree):
@@ -188,14 +236,14 @@ def _review_once(forest: Forest, pairs: Pairs, conflicts: Sequence[Conflict]) ->
         agree = across[turn_angles(steps[across]) < AGREE]
         if not len(agree):
             agree = np.array([branch])
-        held = pooled(pairs, conflicts, agree)
+        held = evidence.pooled(agree)
         for rows, new_R_old in _groups(np.setdiff1d(across, agree), pairs, side, steps):
-            other = pooled(pairs, conflicts, rows)
+            other = evidence.pooled(rows)
             if len(rows) < MIN_GROUP or 2 * other.inliers < held.inliers:
                 continue
-            if _misses_less(other, held):
+            if misses_less(other, held):
                 return forest.turned(side, new_R_old), []
-            if not _misses_less(held, other):
+            if not misses_less(held, other):
                 undecided.append(branch)
                 break
     return None, undecided
@@ -218,16 +266,6 @@ def _groups(
     return groups
 
 
-def _misses_less(a: Missing, b: Missing) -> bool:
-    """Whether pairs `a` miss clearly less than pairs `b` (two Poisson rates, compared by their binomial law)."""
-    missing_a, missing_b = a.missing / FEATURES_PER_REGION, b.missing / FEATURES_PER_REGION
-    if CLEAR_RATIO * missing_a * b.expected >= missing_b * a.expected:
-        return False
-    together = math.ceil(missing_a + missing_b)
-    chance = bdtr(math.floor(missing_a), together, a.expected / (a.expected + b.expected))
-    return bool(chance < SIGNIFICANCE)
-
-
 def _cut(forest: Forest, pairs: Pairs, branches: Sequence[int]) -> Forest:
     """The forest without some of its branches."""
     label = np.arange(len(forest.root))
@@ -237,16 +275,30 @@ def _cut(forest: Forest, pairs: Pairs, branches: Sequence[int]) -> Forest:
     return Forest(forest.cam_R_root, label, kept)
 
 
-def _in_order(pairs: Pairs, num_photos: int) -> Forest | None:
-    """The forest of each photo with the next one, if these steps keep turning the same way."""
-    steps = np.flatnonzero(pairs.strong & (pairs.second == pairs.first + 1))
+@dataclass(frozen=True, eq=False)
+class _Order:
+    """The forest of pairs that are near in the order of the photos, and the near pairs that turn quite differently."""
+
+    forest: Forest
+    against: Int[np.ndarray, "_"]
+
+
+def _in_order(pairs: Pairs, num_photos: int) -> _Order | None:
+    """What the order of the photos tells, if the steps from photo to photo turn the same way.
+
+    Steps over a corner may be wrong or missing: pairs that skip a photo or two bridge them, if they turn as far.
+    """
+    apart = pairs.second - pairs.first
+    steps = np.flatnonzero(apart == 1)
     if len(steps) < max(MIN_STEPS, SAME_TURN_SHARE * (num_photos - 1)):
         return None
-    turn = log(pairs.cam2_R_cam1[steps])
-    same = np.sum(turn[1:] * turn[:-1], axis=1) > 0
-    if np.mean(same) < SAME_TURN_SHARE:
+    one = np.median(log(pairs.cam2_R_cam1[steps]), axis=0)
+    off = turn_angles(pairs.cam2_R_cam1 @ np.swapaxes(exp(apart[:, None] * one), 1, 2))
+    as_expected = off < np.clip(0.5 * apart * np.linalg.norm(one), AGREE, MAX_UNEVENNESS)
+    if as_expected[steps].sum() < SAME_TURN_SHARE * (num_photos - 1) or np.linalg.norm(one) < MIN_TURN:
         return None
     forest = Forest.bare(num_photos)
-    for k in steps.tolist():
-        forest = forest.joined(pairs, k)
-    return forest
+    for k in np.lexsort((-pairs.inliers, apart)).tolist():
+        if apart[k] <= MAX_STEP and as_expected[k] and forest.root[pairs.first[k]] != forest.root[pairs.second[k]]:
+            forest = forest.joined(pairs, k)
+    return _Order(forest, np.flatnonzero((apart <= MAX_STEP) & (off > MIN_SIDE)))

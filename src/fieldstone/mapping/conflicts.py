@@ -7,8 +7,7 @@ and not one feature there matches. Where both photos show the same place, every 
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +44,7 @@ class _Neighbor:
 
     view: int
     from_center: Rigid3
-    """Baseline of length 1."""
+    """Baseline of length 1, or 0 for a camera that only turned."""
     own: Int[np.ndarray, "m"]
     """Keypoints of the photo in the middle, of which `other` are the matches."""
     other: Int[np.ndarray, "m"]
@@ -54,9 +53,12 @@ class _Neighbor:
 
 
 def find_conflicts(
-    graph: MatchGraph, cameras: Sequence[Camera], camera_of_image: Int[np.ndarray, "n"]
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    wanted: Collection[ImagePair] | None = None,
 ) -> dict[ImagePair, Conflict]:
-    """Missing correspondences of every pair that has a relative pose.
+    """Missing correspondences of every pair that has a relative pose, or of those that are wanted.
 
     The neighbours of each photo are brought to one scale by the depths that they share, which tells where any of the
     photo's points would appear in each neighbour.
@@ -81,6 +83,8 @@ def find_conflicts(
         points = bearings[center][known] * depths[known, None]
         for neighbor, scale in zip(star, scales, strict=True):
             view, pair = neighbor.view, (min(center, neighbor.view), max(center, neighbor.view))
+            if wanted is not None and pair not in wanted:
+                continue
             angles[pair] = float(np.median(neighbor.angle))
             before = sums.setdefault(pair, (0, 0))
             if not np.isfinite(scale):
@@ -130,7 +134,7 @@ def _stars(graph: MatchGraph, bearings: Sequence[Float[np.ndarray, "_ 3"]]) -> l
     stars: list[list[_Neighbor]] = [[] for _ in range(graph.num_images)]
     for pair, two_view in sorted(graph.two_views.items()):
         pose = two_view.cam2_from_cam1
-        if pose is None or two_view.kind == "panoramic" or not two_view.inliers.any():
+        if pose is None or not two_view.inliers.any():
             continue
         rows = graph.inlier_matches(pair)
         first, second = rows[:, 0], rows[:, 1]
@@ -163,12 +167,18 @@ def _one_scale(star: Sequence[_Neighbor], num_keypoints: int) -> tuple[Float[np.
     log_scale[np.argmax(has_depth.sum(axis=1))] = 0.0
     while True:
         placed = np.isfinite(log_scale)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", category=RuntimeWarning)  # keypoints without any depth yet
-            known = np.nanmedian(log_depth[placed] + log_scale[placed, None], axis=0)
+        known = _median_of_finite(log_depth[placed] + log_scale[placed, None])
         common = has_depth & np.isfinite(known)
         counts = np.where(placed, 0, common.sum(axis=1))
         if counts.max() < MIN_COMMON:
             return np.exp(log_scale), np.exp(known)
         for s in np.flatnonzero(counts >= max(MIN_COMMON, counts.max() // 2)):
             log_scale[s] = np.median(known[common[s]] - log_depth[s, common[s]])
+
+
+def _median_of_finite(values: Float[np.ndarray, "s k"]) -> Float[np.ndarray, "k"]:
+    """Median of every column without its nan; nan where nothing is left. `np.nanmedian` warns of each such column."""
+    ordered = np.sort(values, axis=0)  # nan goes last
+    count, column = np.isfinite(values).sum(axis=0), np.arange(values.shape[1])
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    return (ordered[low, column] + ordered[high, column]) / 2

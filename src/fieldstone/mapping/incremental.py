@@ -14,7 +14,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.calibration import CalibrationStep
 from fieldstone.mapping.growth import retriangulate, tracks_of_view
 from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
-from fieldstone.mapping.registration import Start, rank_starts, register_view
+from fieldstone.mapping.registration import Start, contradicts_pairs, rank_starts, register_view
 from fieldstone.mapping.structureless import pose_from_partners
 from fieldstone.mapping.view_selection import next_views
 from fieldstone.mapping.working_model import WorkingModel
@@ -179,6 +179,8 @@ def grow(
                 rng = np.random.default_rng([seed, view, int(model.registered_mask().sum()), rung])
                 result = register_view(model, view, options.pnp, stage.min_inliers, rng)
                 pose, reason = result.cam_from_world, result.reason()
+                if pose is not None and (against := contradicts_pairs(model, graph, view, pose)):
+                    pose, reason = None, f"{reason}, but {against}"
             elif stage is LADDER[-1]:
                 if without_points is None:
                     without_points = np.flatnonzero(free & ~model.registered_mask()).tolist()

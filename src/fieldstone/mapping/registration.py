@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from fieldstone.geometry.camera import plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rotation import angle_between
 from fieldstone.geometry.triangulation import in_front_of_both, triangulate_linear, triangulation_angles
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
@@ -18,6 +19,8 @@ from fieldstone.solve.ransac import RansacOptions
 
 BEST_START_ANGLE_DEG = 20.0
 """Wider rays than these make a start no better."""
+MAX_TURN = np.deg2rad(15.0)
+"""Pairs whose rotation differs by more from that of the model contradict it."""
 ANGLE_SAMPLES = 200
 """Matches of a pair whose angles are looked at."""
 
@@ -95,6 +98,28 @@ def register_view(
     if found is None or found.inliers.sum() < min_inliers:
         return Registration(None, 0 if found is None else int(found.inliers.sum()), len(rows))
     return Registration(found.cam_from_world, int(found.inliers.sum()), len(rows))
+
+
+def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_from_world: Rigid3) -> str:
+    """Why a pose of a photo cannot be, or an empty text.
+
+    Most matches with registered photos ask for another rotation, or there are none: where a scene repeats itself, a
+    few false matches turn the points of one place into those of another.
+    """
+    agree, differ = 0, 0
+    for (i, j), two_view in graph.two_views.items():
+        partner = j if view == i else i
+        if view not in (i, j) or model.poses[partner] is None:
+            continue
+        pose, inliers = two_view.cam2_from_cam1, int(two_view.inliers.sum())
+        R = None if pose is None else (pose.R if view == j else pose.R.T) @ model.pose_of(partner).R
+        if R is None or angle_between(R, cam_from_world.R) < MAX_TURN:
+            agree += inliers
+        else:
+            differ += inliers
+    if differ > agree:
+        return f"{differ} of {agree + differ} matches with its photos ask for another rotation"
+    return "" if agree else "none of its photos has matches with this one"
 
 
 def verdict_of_pairs(graph: MatchGraph, view: int) -> str:

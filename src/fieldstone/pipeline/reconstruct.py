@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fieldstone import __version__
+from fieldstone.features.verification import verify_pairs
 from fieldstone.io.atomic import write_json
 from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.colmap import write_colmap
@@ -21,6 +22,7 @@ from fieldstone.io.lock import sole_writer
 from fieldstone.io.matching_txt import is_course_folder
 from fieldstone.io.ply import write_points
 from fieldstone.io.workspace import Workspace
+from fieldstone.mapping.ambiguity import resolve_ambiguity
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
@@ -29,6 +31,7 @@ from fieldstone.pipeline.material import Material, OnStage, match_photos, read_c
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
+from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction, View
 
 Mapper = Literal["auto", "textbook", "incremental", "global"]
@@ -49,7 +52,10 @@ class ReconstructOptions:
     """How a folder becomes a model."""
 
     mapper: Mapper = "auto"
-    """auto: textbook for given matches, incremental for photos; global places all photos at once."""
+    """auto: incremental for photos, and for given matches of places that look alike; textbook for other given matches.
+
+    global places all photos at once.
+    """
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     """Features, matches and two-view geometry of photos."""
     textbook: TextbookOptions = field(default_factory=TextbookOptions)
@@ -85,11 +91,11 @@ def _reconstruct(
     source: Path, out: Path, options: ReconstructOptions, workspace: Workspace, on_stage: OnStage
 ) -> dict[str, Any]:
     course = is_course_folder(source)
-    mapper = options.mapper if options.mapper != "auto" else "textbook" if course else "incremental"
     if course:
         material = read_course(source)
     else:
         material = match_photos(source, options.matching, options.seed, on_stage, workspace)
+    mapper = options.mapper if options.mapper != "auto" else _automatic_mapper(course, material, options)
     on_stage("mapping")
     start = time.perf_counter()
     run = full_size(run_mapper(mapper, material, options), material)
@@ -147,8 +153,24 @@ def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) 
     if mapper == "textbook":
         textbook = replace(options.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
+    if not graph.two_views:  # given matches
+        graph = _verified(material, options)
     automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
     return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look)
+
+
+def _automatic_mapper(course: bool, material: Material, options: ReconstructOptions) -> Mapper:
+    """The textbook mapper for given matches, unless places in them look alike: it knows of one place only."""
+    if not course:
+        return "incremental"
+    resolution = resolve_ambiguity(_verified(material, options), material.cameras, material.camera_of_image)
+    return "incremental" if resolution.left_out.any() else "textbook"
+
+
+def _verified(material: Material, options: ReconstructOptions) -> MatchGraph:
+    """Given matches with the geometry of every pair."""
+    matching, cameras, camera_of_image = options.matching, material.cameras, material.camera_of_image
+    return verify_pairs(material.graph, cameras, camera_of_image, matching.two_view, options.seed, matching.threads)
 
 
 def full_size(run: MappingRun, material: Material) -> MappingRun:

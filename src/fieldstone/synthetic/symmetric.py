@@ -44,6 +44,8 @@ class SymmetricOptions:
     """How unevenly the photos are spaced, and how far they look past the middle; half range."""
     shuffled: bool = False
     """The order of the photos tells nothing of where they stand."""
+    unevenness: float = 1.0
+    """How much heights and distances of the cameras differ: 0 makes photos of different sides exactly alike."""
     distance: float = 3.6
     """From the middle of the building to the cameras."""
     visibility: float = 0.75
@@ -124,10 +126,11 @@ def _ring(options: SymmetricOptions, rng: np.random.Generator) -> tuple[Float[np
     azimuth = step * np.arange(n) + rng.uniform(-jitter, jitter, size=n)
     if options.shuffled:
         azimuth = rng.permutation(azimuth)
-    distance = options.distance * rng.uniform(0.95, 1.05, size=n)
-    height = rng.uniform(0.7, 1.3, size=n)
+    distance = options.distance * (1.0 + 0.05 * options.unevenness * rng.uniform(-1, 1, size=n))
+    height = 1.0 + 0.3 * options.unevenness * rng.uniform(-1, 1, size=n)
     centers = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), height], axis=1)
-    targets = np.stack([*(0.1 * rng.uniform(-1, 1, size=(2, n))), rng.uniform(0.5, 0.7, size=n)], axis=1)
+    sway = options.unevenness * rng.uniform(-0.1, 0.1, size=(3, n))
+    targets = np.stack([sway[0], sway[1], 0.6 + sway[2]], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     return azimuth, Rigid3.stack([look_at(c, t, up) for c, t in zip(centers, targets, strict=True)])
 
