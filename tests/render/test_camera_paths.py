@@ -97,3 +97,12 @@ def test_path_through_poses_meets_each_of_them():
 
 def largest_turn(path):
     return max(float(rotation.angle_between(path.R[k], path.R[k + 1])) for k in range(len(path.R) - 1))
+
+
+def test_focus_point_of_diverging_cameras_lies_in_front():
+    """A camera that is carried to the right turns to the right: the axes meet behind it."""
+    poses = []
+    for x in (-1.0, 0.0, 1.0):
+        center = np.array([x, 0.0, 0.0])
+        poses.append(look_at(center, center + np.array([0.3 * x, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])))
+    assert focus_point(Rigid3.stack(poses))[2] > 0.1

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from fieldstone.errors import InputError
+from fieldstone.field.black_border import kept_inside_borders
 from fieldstone.field.known_points import seen_points
 from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import (
@@ -84,7 +85,7 @@ def read_ray_dataset(source: Path, photos: Path | None, image_size_px: int, *, h
 
 def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) -> RayDataset:
     """Decode the photos of an input."""
-    train = read_images(given.train, image_size_px)
+    train = read_images(given.train, image_size_px, without_borders=True)
     test = read_images(given.test, image_size_px) if held_out else ()
     if not train:
         raise InputError(f"none of {len(given.train)} photos to train on can be read, or all were held out")
@@ -101,6 +102,16 @@ def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) 
         frame.far,
     )
     return RayDataset(train, test, frame, given.points_in_world, bounded, given.seen)
+
+
+def _masked_borders(images: Sequence[PosedImage]) -> list[PosedImage]:
+    """Photos without masks of their own get one of the border that all photos of their camera share."""
+    kept = {}
+    for camera in {id(image.camera): image.camera for image in images}.values():
+        kept[id(camera)] = kept_inside_borders([image for image in images if image.camera is camera])
+        if (keep := kept[id(camera)]) is not None:
+            logger.info("black border of %.1f %% of the photos left out", 100 * (1 - keep.mean()))
+    return [replace(image, keep=kept[id(image.camera)]) if image.keep is None else image for image in images]
 
 
 def with_masks(given: FieldInput, masks: Path | None) -> FieldInput:
@@ -145,8 +156,13 @@ def open_field_input(source: Path, photos: Path | None = None) -> FieldInput:
     )
 
 
-def read_images(photos: Sequence[PosedPhoto], image_size_px: int) -> tuple[PosedImage, ...]:
+def read_images(
+    photos: Sequence[PosedPhoto], image_size_px: int, *, without_borders: bool = False
+) -> tuple[PosedImage, ...]:
     """Decoded and reduced photos; those that cannot be read are left out with a warning.
+
+    Args:
+        without_borders: Mask the black border that all photos of a camera share.
 
     Raises:
         InputError: A photo is too small, or does not have the size of its camera or its mask.
@@ -163,6 +179,8 @@ def read_images(photos: Sequence[PosedPhoto], image_size_px: int) -> tuple[Posed
                 logger.warning("skipped %s", error)
                 continue
             images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels_of(decoded), keep))
+    if without_borders:
+        images = _masked_borders(images)
     reduced = reduce_images(tuple(images), image_size_px)
     for image in reduced:
         if min(image.pixels.shape[:2]) < MIN_SIDE_PX:

@@ -30,8 +30,8 @@ def look_at(center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: 
 def focus_point(cam_from_world: Rigid3) -> Float[np.ndarray, "3"]:
     """The point nearest to the optical axes: minimises sum |(I - d d^T) (x - c)|^2 over centres c and axes d.
 
-    Where the axes are parallel the point is not determined along them; it then lies as far in front of the mean
-    centre as the centres spread.
+    Where the axes are parallel the point is not determined along them, and where they diverge it lies behind the
+    photos; it is then taken as far in front of the mean centre as the centres spread.
     """
     centers, axes = cam_from_world.target_origin_in_source(), cam_from_world.R[:, 2]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -42,7 +42,9 @@ def focus_point(cam_from_world: Rigid3) -> Float[np.ndarray, "3"]:
     prior = mean_center + spread * _unit(axes.mean(axis=0))
     weight = 1e-6
     b = np.einsum("vij,vj->i", projectors, centers) / len(centers)
-    return np.linalg.solve(A + weight * np.eye(3), b + weight * prior)
+    focus = np.linalg.solve(A + weight * np.eye(3), b + weight * prior)
+    depths = np.einsum("vi,vi->v", axes, focus - centers)
+    return focus if np.median(depths) > 0 else prior
 
 
 def up_direction(cam_from_world: Rigid3) -> Float[np.ndarray, "3"]:
