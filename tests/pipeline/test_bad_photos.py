@@ -1,5 +1,6 @@
 """Bad photos among good ones, and what is said of them."""
 
+import json
 import os
 import re
 import shutil
@@ -12,16 +13,26 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD
 
+from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.features.sift import SiftOptions
+from fieldstone.io.colmap import read_colmap
 from fieldstone.io.exif import FOCAL_LENGTH_35MM
 from fieldstone.io.workspace import Workspace
 from fieldstone.pipeline.detection import sharpness
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import match_photos
 from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct
+from fieldstone.synthetic import materials
+from fieldstone.synthetic.construction import Builder
+from fieldstone.synthetic.light import Sky, look_at
+from fieldstone.synthetic.patches import Texture
+from fieldstone.synthetic.photos import House, PhotoOptions, photograph
 
 OPTIONS = MatchingOptions(sift=SiftOptions(max_features=1000), threads=2)
+
+TEXELS = (np.arange(0.015, 16.0, 0.03, dtype=np.float32), np.arange(0.015, 12.0, 0.03, dtype=np.float32))
+HOUSE = PhotoOptions(width=320, height=240, samples_per_axis=1)
 
 
 @pytest.fixture
@@ -142,6 +153,100 @@ def test_exif_that_is_a_little_off_is_believed(photos, factor):
     assert not material.notes
     stated = round(29 * factor) / np.hypot(36.0, 24.0) * np.hypot(320, 240)
     assert material.cameras[0].params[0] == pytest.approx(stated, rel=1e-9)
+
+
+def verdicts_of(folder: Path, tmp_path: Path, code: int) -> tuple[dict, dict[str, str]]:
+    """The run of the real command on a folder, and its verdicts by photo."""
+    assert main(["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--threads", "2"]) == code
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    return record, {photo["name"]: photo["verdict"] for photo in record["photos"]}
+
+
+def test_the_same_photo_saved_anew_is_no_model_and_no_focal_length(photos, tmp_path):
+    with Image.open(photos / "house_00.jpg") as image:
+        for k, path in enumerate(sorted(photos.iterdir())[1:4]):
+            image.save(path, exif=image.getexif(), quality=90 - k)
+    for name in ("house_04.jpg", "house_05.jpg"):
+        (photos / name).unlink()
+    record, verdicts = verdicts_of(photos, tmp_path, 4)
+    assert record["components"] == [0]
+    assert not record["notes"]
+    assert all("no depth" in verdict for verdict in verdicts.values())
+    assert not (tmp_path / "out" / "sparse").exists()
+
+
+def test_photos_without_texture_are_told_so(tmp_path):
+    (tmp_path / "grey").mkdir()
+    for k in range(3):
+        noise = np.random.default_rng(k).normal(120 + k, 1.0, size=(120, 160, 3))
+        Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "grey" / f"{k}.jpg")
+    _, verdicts = verdicts_of(tmp_path / "grey", tmp_path, 4)
+    assert all("of its 0 features" in verdict for verdict in verdicts.values())
+
+
+@pytest.fixture(scope="module")
+def other_photos(tmp_path_factory) -> Path:
+    """Photos of a bare stone wall: one plane, and another place than the house."""
+    folder = tmp_path_factory.mktemp("wall")
+    wall = a_wall()
+    poses = [
+        look_at(np.array([1.2 * (k - 2.5), -9.0 + 0.5 * (k % 2), 3.0 + 0.4 * (k % 3)]), np.array([0.2 * k - 0.5, 0, 3]))
+        for k in range(5)
+    ]
+    shoot(wall, poses, folder, "wall")
+    return folder
+
+
+def a_wall() -> House:
+    build = Builder()
+    build.quad((-8, 0, -2), (1, 0, 0), (0, 0, 1), 16.0, 12.0, materials.fieldstone)
+    texture = Texture.build(materials.fieldstone(*np.meshgrid(*TEXELS), np.random.default_rng(0)), 0.03)
+    return House(
+        (build.surfaces[0].patch,), (texture,), np.ones((1, 3), np.float32), Sky.draw(np.random.default_rng(1))
+    )
+
+
+def shoot(house: House, poses, folder: Path, name: str) -> None:
+    """Photos with the EXIF focal length of their camera."""
+    for k, pose in enumerate(poses):
+        pixels = photograph(house, HOUSE.camera(), pose, HOUSE, np.random.default_rng(k))
+        exif = Image.Exif()
+        exif.get_ifd(IFD.Exif)[FOCAL_LENGTH_35MM] = HOUSE.focal_35mm
+        Image.fromarray(pixels).save(folder / f"{name}_{k}.jpg", quality=95, exif=exif)
+
+
+def test_one_plane_is_reconstructed(other_photos, tmp_path):
+    record, _ = verdicts_of(other_photos, tmp_path, 0)
+    assert record["components"] == [5]
+    xyz = read_colmap(tmp_path / "out" / "sparse" / "0").points.xyz
+    spread = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    assert spread[2] < 0.05 * spread[1]
+
+
+def test_two_scenes_in_one_folder_are_two_models(photos, other_photos, tmp_path):
+    for path in other_photos.iterdir():
+        shutil.copy(path, photos)
+    record, verdicts = verdicts_of(photos, tmp_path, 0)
+    assert sorted(record["components"]) == [5, 6]
+    of_model = [{v.name[:5] for v in read_colmap(tmp_path / "out" / "sparse" / str(k)).views} for k in range(2)]
+    assert sorted(of_model, key=min) == [{"house"}, {"wall_"}]
+    assert all(v.startswith(("registered", "in a model of its own (2 of 2)")) for v in verdicts.values())
+
+
+def test_photos_of_different_places_are_no_model(house_photos, other_photos, tmp_path):
+    (tmp_path / "strangers").mkdir()
+    shutil.copy(house_photos / "house_00.jpg", tmp_path / "strangers")
+    shutil.copy(other_photos / "wall_0.jpg", tmp_path / "strangers")
+    _, verdicts = verdicts_of(tmp_path / "strangers", tmp_path, 4)
+    assert all("shares enough of its" in verdict for verdict in verdicts.values())
+
+
+def test_a_camera_that_only_turns_is_told_so(tmp_path):
+    (tmp_path / "turn").mkdir()
+    poses = [look_at(np.array([0.0, -9.0, 3.0]), np.array([1.3 * k - 2.0, 0.0, 3.0 + 0.3 * (k % 2)])) for k in range(4)]
+    shoot(a_wall(), poses, tmp_path / "turn", "turn")
+    _, verdicts = verdicts_of(tmp_path / "turn", tmp_path, 4)
+    assert all("only turned" in verdict for verdict in verdicts.values())
 
 
 def rewrite_focal(photos: Path, focal_35mm: float) -> None:

@@ -68,3 +68,8 @@ def test_a_turning_camera_gives_the_focal_length(focal):
 def test_a_plane_seen_from_several_places_is_no_turning_camera():
     assert vote_focal_of_rotations(turns(1.0, 15, 0.0, shift=0.3), np.ones(15)) is None
     assert vote_focal_of_rotations(np.empty((0, 3, 3)), np.empty(0)) is None
+
+
+def test_copies_of_one_photo_tell_no_focal_length():
+    noise = 1e-5 * np.random.default_rng(0).normal(size=(10, 3, 3))
+    assert vote_focal_of_rotations(np.eye(3) + noise, np.ones(10)) is None

@@ -11,13 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.geometry.rotation import nearest_rotation
+from fieldstone.geometry.rotation import angle_between, nearest_rotation
 
 SMALLEST_RATIO, LARGEST_RATIO, GRID = 0.2, 8.0, 160
 TRUNCATION = 0.2
 """A pair that is further than this from being essential says nothing more: it may be wrong altogether."""
 LARGEST_DEVIATION = 0.02
 """Homographies that are further than this from rotations, on average, are those of a plane."""
+
+SMALLEST_TURN = float(np.deg2rad(1.0))
+"""A camera that turns less, on average, tells nothing: copies of one photo fit any focal length."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ def vote_focal(fundamentals: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarr
 def vote_focal_of_rotations(
     homographies: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"]
 ) -> FocalVote | None:
-    """The focal length f for which K^-1 H K is most nearly a rotation over all pairs; None if none comes near.
+    """The focal length f for which K^-1 H K is most nearly a rotation over all pairs; None if none comes near,
+    or if the camera hardly turns.
 
     A camera that turns on the spot has no fundamental matrix, and with a wrong focal length its homographies look like
     those of a plane seen from several places.
@@ -66,7 +70,9 @@ def vote_focal_of_rotations(
     if not len(homographies):
         return None
     vote, cost = _lowest(lambda focal: rotation_cost(homographies, weights, focal))
-    return vote if cost < LARGEST_DEVIATION else None
+    R = nearest_rotation(_with_focal(homographies, vote.ratio))
+    turn = float(np.average(angle_between(R, np.broadcast_to(np.eye(3), R.shape)), weights=weights))
+    return vote if cost < LARGEST_DEVIATION and turn > SMALLEST_TURN else None
 
 
 def _lowest(cost_of: Callable[[float], float]) -> tuple[FocalVote, float]:
@@ -85,11 +91,16 @@ def _lowest(cost_of: Callable[[float], float]) -> tuple[FocalVote, float]:
 
 def rotation_cost(homographies: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"], focal: float) -> float:
     """Weighted mean of the pairs' truncated distance from being rotations."""
-    scale = np.array([focal, focal, 1.0])
-    M = homographies * scale / scale[:, None]
-    M = M / np.cbrt(np.linalg.det(M))[:, None, None]
+    M = _with_focal(homographies, focal)
     distance = np.minimum(np.linalg.norm(M - nearest_rotation(M), axis=(1, 2)), TRUNCATION)
     return float(np.sum(weights * distance) / np.sum(weights))
+
+
+def _with_focal(homographies: Float[np.ndarray, "k 3 3"], focal: float) -> Float[np.ndarray, "k 3 3"]:
+    """K^-1 H K of determinant 1."""
+    scale = np.array([focal, focal, 1.0])
+    M = homographies * scale / scale[:, None]
+    return M / np.cbrt(np.linalg.det(M))[:, None, None]
 
 
 def focal_cost(fundamentals: Float[np.ndarray, "k 3 3"], weights: Float[np.ndarray, "k"], focal: float) -> float:
