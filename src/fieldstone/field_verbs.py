@@ -57,7 +57,7 @@ def train(
         alpha: Use the transparency of photos; --no-alpha takes them as they look on the background (fast only).
         photos: Folder with the photos of a reconstruction, if they are not where they were.
         masks: Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. Nothing is learned where
-            they are black, nor measured (fast only).
+            they are black, nor measured; by default those of the reconstruction (fast only).
         size: Photos are reduced to this length of their longer side, in pixels (fast only).
         device: cpu, cuda, mps (tiny and nerf).
         threads: 0 takes all cores. The result is the same for any number.

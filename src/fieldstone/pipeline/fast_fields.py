@@ -100,7 +100,8 @@ def train_fast_run(
         plan: The plan.json of another run, to be followed to the letter; the budget is then ignored.
         use_alpha: False takes photos with alpha as photos on the background.
         memory_gib: What grids and rays may take; the finest grid is chosen to fit.
-        masks: Folder with masks of the photos; nothing is learned where they are black, nor measured.
+        masks: Folder with masks of the photos; nothing is learned where they are black, nor measured. None: those of
+            the reconstruction, if it had some.
         size_px: Photos are reduced to this length of their longer side.
 
     Returns:
@@ -118,7 +119,7 @@ def train_fast_run(
         compile_kernels(executor)
         started = time.perf_counter()
         on_stage("reading photos")
-        given_photos = with_masks(open_field_input(source, photos), masks)
+        given_photos = with_masks(open_field_input(source, photos), masks, source)
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         training = _open(dataset, given, budget_s, use_alpha, seed, executor, memory_gib)

@@ -114,12 +114,17 @@ def _masked_borders(images: Sequence[PosedImage]) -> list[PosedImage]:
     return [replace(image, keep=kept[id(image.camera)]) if image.keep is None else image for image in images]
 
 
-def with_masks(given: FieldInput, masks: Path | None) -> FieldInput:
-    """The input with the masks of a folder, see `io.masks.find_masks`; None: as it is.
+def with_masks(given: FieldInput, masks: Path | None, source: Path) -> FieldInput:
+    """The input with the masks of a folder, see `io.masks.find_masks`.
+
+    Args:
+        masks: None: those that the reconstruction in `source` was made with, or those that the input names.
 
     Raises:
         InputError: No such folder, no mask for any photo, or a mask of another size than its photo.
     """
+    if masks is None and (named := _recorded(source, "masks_folder")) is not None and named.is_dir():
+        masks = named
     if masks is None:
         return given
     found = find_masks(masks, [photo.path for photo in (*given.train, *given.test)])
@@ -281,19 +286,23 @@ def _colmap_input(source: Path, photos: Path | None) -> FieldInput:
 
 def _photo_folder(source: Path, model: Reconstruction) -> Path:
     """Where the photos of a model lie."""
-    candidates = [source / "images"]
-    try:
-        record = json.loads((source / "run.json").read_text())
-        candidates.append(source / str(record["photos_folder"]))
-    except (OSError, ValueError, KeyError, TypeError):
-        logger.debug("%s: no run.json that says where the photos are", source)
-    candidates.append(source)
+    recorded = _recorded(source, "photos_folder")
+    candidates = [source / "images", *([] if recorded is None else [recorded]), source]
     names = [model.views[i].name for i in model.registered().tolist()]
     for folder in candidates:
         if any((folder / name).is_file() for name in names):
             return folder
     searched = ", ".join(str(candidate) for candidate in candidates)
     raise InputError(f"{source}: the photos of the model are in none of {searched}; give --photos FOLDER")
+
+
+def _recorded(source: Path, name: str) -> Path | None:
+    """A folder that the run.json of a reconstruction names, relative to it."""
+    try:
+        return source / str(json.loads((source / "run.json").read_text())[name])
+    except (OSError, ValueError, KeyError, TypeError):
+        logger.debug("%s: no run.json that names %s", source, name)
+        return None
 
 
 def pixels_of(photo: Photo) -> np.ndarray:

@@ -111,6 +111,8 @@ def _reconstruct(
     record = run_record(source, mapper, run, material, options.seed, seconds)
     # Relative, so that the two folders may move together.
     record["photos_folder"] = Path(os.path.relpath(source.resolve(), out.resolve())).as_posix()
+    if options.matching.masks is not None:
+        record["masks_folder"] = Path(os.path.relpath(options.matching.masks.resolve(), out.resolve())).as_posix()
     write_json(out / "run.json", record)
     write_report(out)
     return record
