@@ -17,7 +17,7 @@ import tyro
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
-from fieldstone.field_verbs import Out, Source, mesh, plain_console, render, seconds, train
+from fieldstone.field_verbs import Out, Source, mesh, plain_console, render, seconds, splat, train
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -165,7 +165,10 @@ def report(source: Source, /) -> int:
     return 0
 
 
-VERBS = {"demo": demo, "reconstruct": reconstruct, "train": train, "render": render, "mesh": mesh, "report": report}
+VERBS = {
+    "demo": demo, "reconstruct": reconstruct, "train": train, "render": render, "mesh": mesh, "splat": splat,
+    "report": report,
+}  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The verbs of `fieldstone` that make and show fields: train, render, mesh; see `cli`."""
+"""The verbs of `fieldstone` that make and show fields: train, render, mesh, splat; see `cli`."""
 
 from __future__ import annotations
 
@@ -191,6 +191,29 @@ def mesh(
         f"{record['vertices']} vertices, {record['faces']} faces, {record['floaters_removed']} floaters removed; "
         f"silhouettes agree with the field by {100 * record['silhouette_iou']:.1f} % (IoU), depths "
         f"{'nowhere comparable' if depth is None else f'to {depth:.2f} % (median)'} -> {source / record['path']}",
+        markup=False,
+    )
+    return 0
+
+
+def splat(source: Source, /, *, cells: int | None = None, level: float = 0.5, threads: int = 0) -> int:
+    """Gaussian splats (PLY) of a trained fast field, for viewers of 3D Gaussian splatting, and how alike they look.
+
+    Args:
+        source: Folder that `train` wrote; splats.ply and splats.json go there.
+        cells: Grid cells along the longest side; by default as the field, at most 320.
+        level: Share of the light that matter must stop to count as solid.
+        threads: 0 takes all cores.
+    """
+    from fieldstone.pipeline.field_splats import splat_run
+
+    console = plain_console()
+    with console.status("reading") as status:
+        record = splat_run(source, cells=cells, level=level, threads=threads or None, on_stage=status.update)
+    found = record["psnr_to_field"]
+    console.print(
+        f"{record['splats']} splats; against the field: "
+        f"{'not comparable' if found is None else f'PSNR {found:.2f} dB'} -> {source / record['path']}",
         markup=False,
     )
     return 0

@@ -1,4 +1,4 @@
-"""A trained ball to a mesh, as typed."""
+"""A trained ball to a mesh and to splats, as typed."""
 
 import json
 
@@ -12,6 +12,7 @@ from fieldstone.io.photos import write_photo
 from fieldstone.io.ply import read_points
 from fieldstone.pipeline.fast_fields import train_fast_run
 from fieldstone.pipeline.field_mesh import mesh_run
+from fieldstone.pipeline.field_splats import splat_run
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,20 @@ def test_formats_as_typed(trained, capsys):
     assert "IoU" in capsys.readouterr().out
 
 
+def test_splats_look_like_the_field(trained, capsys):
+    assert main(["splat", str(trained), "--threads", "1"]) == 0
+    record = json.loads((trained / "splats.json").read_text())
+    assert "PSNR" in capsys.readouterr().out
+    points = read_points(trained / record["path"])
+    assert len(points.xyz) == record["splats"]
+    # Splats lie an edge below the surface, and cells are 0.07 wide.
+    assert np.median(np.abs(np.linalg.norm(points.xyz, axis=1) - RADIUS)) < 0.12
+    # White views are met to 9 dB, the ball without its colours to 17 dB; pixels are as large as splats here.
+    assert record["psnr_to_field"] > 22
+
+
+@pytest.mark.parametrize("run", [mesh_run, splat_run])
 @pytest.mark.parametrize(("options", "message"), [({"level": 1.0}, "--level"), ({"cells": 1}, "--cells")])
-def test_mistakes_are_named(trained, options, message):
+def test_mistakes_are_named(trained, run, options, message):
     with pytest.raises(InputError, match=message):
-        mesh_run(trained, **options)
+        run(trained, **options)

@@ -134,20 +134,14 @@ def normalized_mesh(
 
 def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], poses: Rigid3) -> dict[str, Any]:
     """Silhouettes (intersection over union) and depths of the mesh against those of the field, in views of photos."""
-    stored = header["cameras"]
-    overlap, union, depths = 0, 0, []
-    views = np.unique(np.linspace(0, len(poses.t) - 1, COMPARED_VIEWS).astype(np.int64)).tolist()
-    for v in views:
-        c = stored[header["camera_of_view"][v]]
-        camera = Camera(c["model"], c["width"], c["height"], np.array(c["params"]))
-        factor = min(COMPARED_SIZE_PX / max(camera.width, camera.height), 1.0)
-        camera = rescale(camera, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
-        seen = render_view(render_rays, camera, poses[v])
-        depth = mesh_depth(mesh, camera, poses[v])
+    overlap, union, depths, views = 0, 0, [], compared_views(header, poses, COMPARED_VIEWS, COMPARED_SIZE_PX)
+    for camera, pose in views:
+        seen = render_view(render_rays, camera, pose)
+        depth = mesh_depth(mesh, camera, pose)
         solid, of_mesh = seen.opacity > 0.5, np.isfinite(depth)
         overlap += int(np.count_nonzero(solid & of_mesh))
         union += int(np.count_nonzero(solid | of_mesh))
-        along_z = rays_from_view(camera, poses[v]).directions @ poses[v].R[2]
+        along_z = rays_from_view(camera, pose).directions @ pose.R[2]
         field_depth = seen.depth * along_z.reshape(depth.shape)
         both = of_mesh & (seen.opacity > 0.95)
         depths.append(np.abs(depth[both] / field_depth[both] - 1.0))
@@ -158,6 +152,18 @@ def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], p
         "compared": f"{len(views)} views of training photos, longer side at most {COMPARED_SIZE_PX} pixels; "
         "silhouette: opacity above 0.5; depth: where opacity is above 0.95",
     }
+
+
+def compared_views(header: Mapping[str, Any], poses: Rigid3, count: int, size_px: int) -> list[tuple[Camera, Rigid3]]:
+    """Cameras at the poses of some training photos, their longer sides at most `size_px`."""
+    found = []
+    for v in np.unique(np.linspace(0, len(poses.t) - 1, count).astype(np.int64)).tolist():
+        c = header["cameras"][header["camera_of_view"][v]]
+        camera = Camera(c["model"], c["width"], c["height"], np.array(c["params"]))
+        factor = min(size_px / max(camera.width, camera.height), 1.0)
+        size = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+        found.append((rescale(camera, *size), poses[v]))
+    return found
 
 
 def _upright(mesh: Mesh, poses: Rigid3) -> Mesh:

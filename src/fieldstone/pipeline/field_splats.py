@@ -1,0 +1,119 @@
+"""A trained fast field to Gaussian splats, and how much they look like the field and the photos."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.errors import InputError
+from fieldstone.evaluate.image_metrics import psnr, quantize
+from fieldstone.field.fast_decoder import decode
+from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
+from fieldstone.field.fast_grid_numba import interpolate_numba
+from fieldstone.field.projection import project_points
+from fieldstone.field.radiance_field import FieldFrame, in_world
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.atomic import write_json
+from fieldstone.io.checkpoint import read_checkpoint
+from fieldstone.io.splats import write_splats
+from fieldstone.pipeline.field_mesh import compared_views, normalized_mesh
+from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
+from fieldstone.render.splat_view_numba import splat_view
+from fieldstone.render.splatting import splats_of_surface
+from fieldstone.render.views import render_view
+from fieldstone.scene.mesh import Mesh
+from fieldstone.scene.splats import Splats
+
+logger = logging.getLogger(__name__)
+
+COMPARED_VIEWS, COMPARED_SIZE_PX = 4, 800
+"""How many photos' views, at most at which size, the splats are compared with their field in."""
+
+SPLATS, RECORD = "splats.ply", "splats.json"
+
+
+def splat_run(
+    out: Path,
+    *,
+    cells: int | None = None,
+    level: float = 0.5,
+    threads: int | None = None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+) -> dict[str, Any]:
+    """Write `out`/splats.ply from the fast field that training left in `out`, and `out`/splats.json about it.
+
+    Args:
+        cells: Grid cells along the longest side; None: as the field, at most 320.
+        level: Share of the light that matter must stop to count as solid.
+
+    Returns:
+        What `splats.json` holds: how many there are, and the PSNR of their views against those of the field.
+
+    Raises:
+        InputError: No fast field in `out`, or nothing solid in it.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"--level must lie between 0 and 1, got {level:g}")
+    if cells is not None and cells < 2:
+        raise InputError(f"--cells must be at least 2, got {cells}")
+    tensors, header = read_checkpoint(out / CHECKPOINT)
+    if header["field"] != "fast":
+        raise InputError(f"{out}: splats need the fast field, not the {header['field']} network; train without --field")
+    poses, state_tensors = split_tensors(tensors)
+    field, frame = field_from_tensors(state_tensors), frame_from_header(header)
+    on_stage("extracting the surface")
+    splats = splats_of_field(field, frame, poses, cells, level)
+    write_splats(splats, out / SPLATS)
+    on_stage("comparing it with the field")
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+        render_rays = in_world(renderer(field, frame, executor), frame)
+        found, about = [], "no view without lens distortion to compare with"
+        for camera, pose in compared_views(header, poses, COMPARED_VIEWS, COMPARED_SIZE_PX):
+            if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+                continue
+            seen = quantize(splat_view(splats, camera, pose, frame.background).astype(np.float32))
+            shown = quantize(render_view(render_rays, camera, pose).rgb)
+            found.append(psnr(seen.astype(np.float32) / 255, shown.astype(np.float32) / 255))
+            about = (
+                f"{len(found)} views of training photos, {camera.width} pixels wide, "
+                "blended as 3D Gaussian splatting does, over the background of the field"
+            )
+    record = {
+        "path": SPLATS,
+        "splats": len(splats),
+        "psnr_to_field": float(np.mean(found)) if found else None,
+        "compared": about,
+    }
+    write_json(out / RECORD, record)
+    return record
+
+
+def splats_of_field(field: FastField, frame: FieldFrame, poses: Rigid3, cells: int | None, level: float) -> Splats:
+    """The splats of the surface of a field, in the world of the photos."""
+    mesh, floaters = normalized_mesh(field, frame, poses, cells, level)
+    world = frame.normalized_from_world
+    back = world.inverse()
+    finest = float(field.layout.spacings[-1])
+    mesh = Mesh(back.apply(mesh.vertices), mesh.faces)
+    grid = field.layout.arrays(field.table)
+    upper = field.layout.extent - 1e-6
+
+    def colors_from(points: Float[np.ndarray, "n 3"]) -> Callable[[np.ndarray], np.ndarray]:
+        inside = world.apply(points)
+        if field.projection.active:
+            inside = project_points(field.projection, inside)
+        local = np.clip(inside - field.occupancy.lower, 0.0, upper)
+        features = interpolate_numba(grid, np.ascontiguousarray(local, dtype=np.float32)).astype(np.float64)
+        return lambda directions: decode(field.decoder, features, directions @ world.R.T)
+
+    depth = 0.0 if field.projection.active else 0.5 * finest / world.scale
+    splats = splats_of_surface(mesh, colors_from, poses.target_origin_in_source(), depth)
+    logger.info("%d splats, %d floaters removed", len(splats), floaters)
+    return splats
