@@ -39,10 +39,10 @@ class RefinementOptions:
     """Adjustments while the model grows."""
     final: BundleOptions = field(
         default_factory=lambda: BundleOptions(
-            loss="soft_l1", max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
+            loss="cauchy", loss_scale_px=0.5, max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
         )
     )
-    """The last adjustments."""
+    """The last adjustments; residuals of SIFT keypoints have tails that are even heavier than those of this loss."""
     min_views_for_intrinsics: int = 3
     """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
     max_rounds: int = 4

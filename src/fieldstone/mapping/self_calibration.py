@@ -14,6 +14,7 @@ from fieldstone.mapping.calibration import LADDER, CalibrationStep, steps_above
 from fieldstone.mapping.growth import covering_tracks, plane_coordinates
 from fieldstone.mapping.refinement import Calibration, RefinementOptions, adjust
 from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.solve.robust_loss import cauchy
 from fieldstone.solve.robust_triangulation import triangulate_robust
 
 logger = logging.getLogger(__name__)
@@ -34,13 +35,20 @@ class SelfCalibrationOptions:
     """Predictions that are further off count as just this bad."""
     min_judges: int = 100
     """With fewer predictions nothing is decided, and the calibration stays as it is."""
+    loss_scale_px: float = 0.5
+    """Errors beyond it count ever less: they tell of false matches rather than of cameras."""
     principal_point: bool = True
     """Whether steps that move the principal point are on the ladder."""
+
+    def badness(self, errors_px: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+        """Robust squared errors, in squared pixels."""
+        rho, _ = cauchy(self.loss_scale_px)(np.minimum(errors_px, self.max_error_px) ** 2)
+        return rho
 
 
 @dataclass(frozen=True)
 class CalibrationTrial:
-    """One step of the ladder against the best before it: mean squared errors of prediction, and the verdict."""
+    """One step of the ladder against the best before it: robust root mean squares of prediction, and the verdict."""
 
     step: CalibrationStep
     rms_before_px: float
@@ -75,7 +83,7 @@ def climb(
     best = tuple(calibration)
     above = [() if step is None else steps_above(step, principal_point=options.principal_point) for step in calibration]
     fitted = adjust(model, refinement, best, bundle=refinement.final, points=learners)
-    errors = np.minimum(prediction_errors(fitted, rows, predictions), options.max_error_px) ** 2
+    errors = options.badness(prediction_errors(fitted, rows, predictions))
     trials: list[CalibrationTrial] = []
     refused = 0
     for step in LADDER:
@@ -84,7 +92,7 @@ def climb(
         if candidate == best or (refused == 2 and not of_another_kind):
             continue
         richer = adjust(fitted, refinement, candidate, bundle=refinement.final, points=learners)
-        new_errors = np.minimum(prediction_errors(richer, rows, predictions), options.max_error_px) ** 2
+        new_errors = options.badness(prediction_errors(richer, rows, predictions))
         gain = errors - new_errors
         significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
         clear = gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance
