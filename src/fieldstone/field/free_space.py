@@ -31,7 +31,10 @@ FARTHEST = 1e4
 """What is further away, in units of the frame, is at infinity."""
 
 MIN_PHOTOS, MANY_PHOTOS = 3, 8
-"""What is nearer to a photo than half of its points is seen by so many photos, if there are so many; else by 2."""
+"""What is nearer to a photo than most of its points is seen by so many photos, if there are so many; else by 2."""
+
+NEAR_PERCENT = 90.0
+"""Percentile of the distances of its points up to which a place is near to a photo."""
 
 MIN_SEEN = 20
 """Fewer points of a photo say nothing of its space."""
@@ -50,7 +53,7 @@ def carve_free_space(
     """The occupancy without cells that photos look through.
 
     A cell is empty if all its corners lie in front of the known points around them in one photo, or if it is nearer
-    to a photo than half of its points are and too few photos see it: nothing but this photo would say what is there,
+    to a photo than most of its points are and too few photos see it: nothing but this photo would say what is there,
     and anything it shows could be put there.
 
     Args:
@@ -71,7 +74,7 @@ def carve_free_space(
         if points is not None and len(points.xyz) >= MIN_SEEN:
             distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
             free[inside] = away[inside] < FREE_SHARE * least_distance(image, points.xyz, distances, pixels[inside])
-            near = inside & (away < np.median(distances))
+            near = inside & (away < np.percentile(distances, NEAR_PERCENT))
         flags = ((free, np.logical_and), (inside, np.logical_or), (near, np.logical_or))
         free, visible, near = (_at_corners(flag.reshape(shape), combine) for flag, combine in flags)
         return free, visible, near
