@@ -14,6 +14,7 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.ambiguity import resolve_ambiguity, with_ambiguity
 from fieldstone.mapping.calibration import CalibrationStep, growing_step, with_models
 from fieldstone.mapping.global_mapper import map_global
+from fieldstone.mapping.growth_memory import GrowthMemory
 from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
 from fieldstone.mapping.point_update import drop_outliers
 from fieldstone.mapping.record import Drop, MappingRun, StageRecord
@@ -46,8 +47,7 @@ class AutomaticOptions:
 
     def with_threads(self, threads: int) -> AutomaticOptions:
         """The same with so many threads, which changes nothing but the time."""
-        refinement = replace(self.incremental.refinement, threads=threads)
-        return replace(self, incremental=replace(self.incremental, refinement=refinement))
+        return replace(self, incremental=self.incremental.with_threads(threads))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,7 @@ def map_automatic(
     options: AutomaticOptions,
     seed: int,
     second_look: Sequence[MoreMatches] = (),
+    memory: GrowthMemory | None = None,
 ) -> MappingRun:
     """Models of all components; the one with most photos is the reconstruction, the others are kept beside it.
 
@@ -76,11 +77,12 @@ def map_automatic(
         graph: Verified, see `features.verification`.
         known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
         second_look: Ways to find more matches for photos that no model takes in, tried in turn.
+        memory: Where growth that was stopped is taken up again.
     """
     resolution = resolve_ambiguity(graph, cameras, camera_of_image)
     if resolution.left_out.any():
         second_look = ()  # it would find again what was left out
-    run = _map_components(resolution.graph, cameras, camera_of_image, known, options, seed, second_look)
+    run = _map_components(resolution.graph, cameras, camera_of_image, known, options, seed, second_look, memory)
     return with_ambiguity(run, resolution)
 
 
@@ -92,17 +94,18 @@ def _map_components(
     options: AutomaticOptions,
     seed: int,
     second_look: Sequence[MoreMatches],
+    memory: GrowthMemory | None,
 ) -> MappingRun:
     """`map_automatic` for a graph whose pairs do not contradict each other."""
     calibration = [None if known[c] else growing_step(camera) for c, camera in enumerate(cameras)]
     start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
-    grown = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed)
+    grown = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, memory)
     if not grown:
         verdicts = {name: f"not registered: {verdict_of_pairs(graph, v)}" for v, name in enumerate(graph.names)}
         nothing = WorkingModel.start(tuple(cameras), camera_of_image, Observations.empty())
         return MappingRun(to_reconstruction(nothing, graph), graph, None, (), (), None, verdicts)
-    grown, graph = rescue(grown, graph, second_look, options.incremental, seed)
+    grown, graph = rescue(grown, graph, second_look, options.incremental, seed, memory)
     finished = [finish(component, options, np.random.default_rng([seed, k])) for k, component in enumerate(grown)]
     best = finished[0]
     records: list[StageRecord] = record_views(best.before, graph.names, "before BA")

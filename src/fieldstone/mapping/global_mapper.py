@@ -15,6 +15,7 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.calibration import CalibrationStep
 from fieldstone.mapping.growth import covering_tracks, plane_coordinates, retriangulate
+from fieldstone.mapping.growth_memory import GrowthMemory
 from fieldstone.mapping.incremental import LADDER, GrownModel, IncrementalOptions, grow
 from fieldstone.mapping.refinement import adjust
 from fieldstone.mapping.working_model import WorkingModel
@@ -57,6 +58,7 @@ def map_global(
     calibration: Sequence[CalibrationStep | None],
     options: IncrementalOptions,
     seed: int,
+    memory: GrowthMemory | None = None,
 ) -> list[GrownModel]:
     """Every component of the graph, the one with most photos first; arguments as `map_incremental`.
 
@@ -79,7 +81,7 @@ def map_global(
             continue
         model, pair = placed
         reasons = dict.fromkeys(np.flatnonzero(model.registered_mask()).tolist(), "placed with all others at once")
-        grown.append(grow(model, graph, pair, reasons, free, tuple(calibration), options, seed))
+        grown.append(grow(model, graph, pair, reasons, free, tuple(calibration), options, seed, memory))
         free = free & ~grown[-1].model.registered_mask()
         logger.info("component of %d photos", grown[-1].model.registered_mask().sum())
         edges = edges.where(np.all(free[edges.pairs], axis=1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -13,6 +13,7 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.calibration import CalibrationStep
 from fieldstone.mapping.growth import retriangulate, tracks_of_view
+from fieldstone.mapping.growth_memory import GrowthMemory, GrowthState, Kept, as_found_again, name_of_growth
 from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
 from fieldstone.mapping.registration import Start, contradicts_pairs, rank_starts, register_view
 from fieldstone.mapping.structureless import pose_from_partners
@@ -61,6 +62,10 @@ class IncrementalOptions:
     max_starts: int = 8
     """Pairs tried as the start of one component, at each rung of the ladder."""
 
+    def with_threads(self, threads: int) -> IncrementalOptions:
+        """The same with so many threads, which changes nothing but the time."""
+        return replace(self, refinement=replace(self.refinement, threads=threads))
+
 
 @dataclass(frozen=True, eq=False)
 class GrownModel:
@@ -83,12 +88,14 @@ def map_incremental(
     calibration: Sequence[CalibrationStep | None],
     options: IncrementalOptions,
     seed: int,
+    memory: GrowthMemory | None = None,
 ) -> list[GrownModel]:
     """Every component of the graph that grows from a pair, the one with most photos first.
 
     Args:
         graph: Verified: `two_views` hold the geometry and inliers of every pair.
         calibration: Per camera, what may be refined from the start; None keeps its intrinsics as they are.
+        memory: Where growth that was stopped is taken up again.
 
     Returns:
         Models that share no photo, before the final refinement; empty if no pair gives a start.
@@ -99,7 +106,7 @@ def map_incremental(
     grown: list[GrownModel] = []
     for stage in LADDER:
         while free.sum() >= options.min_model_size:
-            model = _grow_one(graph, empty, free, tuple(calibration), stage, options, seed)
+            model = _grow_one(graph, empty, free, tuple(calibration), stage, options, seed, memory)
             if model is None:
                 break
             grown.append(model)
@@ -118,6 +125,7 @@ def _grow_one(
     stage: Stage,
     options: IncrementalOptions,
     seed: int,
+    memory: GrowthMemory | None,
 ) -> GrownModel | None:
     """The model of the first start that grows beyond its pair; failing that, the best pair that is stable."""
     fallback = None
@@ -127,7 +135,7 @@ def _grow_one(
         if model is None:
             continue
         reasons = dict.fromkeys(start.pair, f"start of the model: {start.num_points} points")
-        grown = grow(model, graph, start.pair, reasons, free, calibration, options, seed)
+        grown = grow(model, graph, start.pair, reasons, free, calibration, options, seed, memory)
         if grown.model.registered_mask().sum() > 2 or free.sum() == 2:
             return grown
         fallback = fallback or grown
@@ -156,6 +164,7 @@ def grow(
     calibration: tuple[CalibrationStep | None, ...],
     options: IncrementalOptions,
     seed: int,
+    memory: GrowthMemory | None = None,
 ) -> GrownModel:
     """Register photo after photo until none of the free ones fits, relaxing the thresholds step by step.
 
@@ -164,12 +173,16 @@ def grow(
 
     Args:
         reasons: For the photos that are registered already.
+        memory: Keeps the state after every adjustment of everything; the growth goes on from the one it has.
     """
-    reasons = dict(reasons)
-    failures: dict[int, str] = {}
+    state = GrowthState(model, 0, dict(reasons), {})
+    parts = [list(initial_pair), list(calibration), options.with_threads(1), seed]
+    kept = None if memory is None else Kept(memory, name_of_growth(memory, model, graph, free, parts))
+    state = state if kept is None else kept.last(state)
+    model, reasons, failures = state.model, state.reasons, state.failures
     blocked = frozenset(np.flatnonzero(~free).tolist())
     last_global = int(model.registered_mask().sum())
-    for rung, stage in enumerate(LADDER):
+    for rung, stage in list(enumerate(LADDER))[state.rung :]:
         tried: frozenset[int] = frozenset()
         without_points: list[int] | None = None
         while True:
@@ -211,6 +224,7 @@ def grow(
             without_points = None
             if everything:
                 last_global, tried = size, frozenset()  # a better model may take what a worse one could not
+                model = as_found_again(GrowthState(model, rung, reasons, failures), kept)
         everyone = model.registered_mask() | ~free
         if everyone.all():
             break

@@ -11,6 +11,7 @@ from jaxtyping import Bool
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.growth import retriangulate
+from fieldstone.mapping.growth_memory import GrowthMemory
 from fieldstone.mapping.incremental import LADDER, GrownModel, IncrementalOptions, collapsed, grow
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
@@ -38,6 +39,7 @@ def rescue(
     attempts: Sequence[MoreMatches],
     options: IncrementalOptions,
     seed: int,
+    memory: GrowthMemory | None = None,
 ) -> tuple[list[GrownModel], MatchGraph]:
     """The models with the largest one grown further where more matches allow it, and the graph that it took.
 
@@ -53,7 +55,7 @@ def rescue(
         larger_graph = attempt(graph, Wanted(lost, registered, largest.model.cameras))
         if larger_graph is None:
             continue
-        larger = _go_on(largest, larger_graph, ~held | registered, options, seed)
+        larger = _go_on(largest, larger_graph, ~held | registered, options, seed, memory)
         gained = 0 if larger is None else int(larger.model.registered_mask().sum() - registered.sum())
         logger.info("a second look at %d photos places %d of them", len(lost), gained)
         if larger is not None and gained > 0:
@@ -62,7 +64,12 @@ def rescue(
 
 
 def _go_on(
-    grown: GrownModel, graph: MatchGraph, free: Bool[np.ndarray, "n"], options: IncrementalOptions, seed: int
+    grown: GrownModel,
+    graph: MatchGraph,
+    free: Bool[np.ndarray, "n"],
+    options: IncrementalOptions,
+    seed: int,
+    memory: GrowthMemory | None,
 ) -> GrownModel | None:
     """The same poses on the tracks of another graph, grown further; None if the points do not come back."""
     tracks, _ = build_tracks(graph, split_conflicts=True)
@@ -76,4 +83,4 @@ def _go_on(
     )
     if collapsed(grown.model, model):
         return None
-    return grow(model, graph, grown.initial_pair, grown.reasons, free, grown.calibration, options, seed)
+    return grow(model, graph, grown.initial_pair, grown.reasons, free, grown.calibration, options, seed, memory)

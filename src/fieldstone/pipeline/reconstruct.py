@@ -24,8 +24,10 @@ from fieldstone.io.ply import write_points
 from fieldstone.io.workspace import Workspace
 from fieldstone.mapping.ambiguity import resolve_ambiguity
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.growth_memory import GrowthMemory
 from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
+from fieldstone.pipeline.kept_growth import KeptGrowth
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import Material, OnStage, match_photos, read_course
 from fieldstone.report.figure_store import write_figures
@@ -72,8 +74,8 @@ def reconstruct(
     """Reconstruct a folder of photos, or one in the course format, and write everything to `out`.
 
     Writes `sparse/0/` (COLMAP binary; further components in `sparse/1/` and so on), `points.ply`, `figures/`,
-    `run.json` and `report.html`. Features, matches and two-view geometry are kept in `work/` as they are found: a run
-    that was stopped goes on from there when it is started again, and ends with the same bytes.
+    `run.json` and `report.html`. Features, matches, two-view geometry and the growing model are kept in `work/` as they
+    are found: a run that was stopped goes on from there when it is started again, and ends with the same bytes.
 
     Returns:
         What `run.json` holds.
@@ -98,7 +100,8 @@ def _reconstruct(
     mapper = options.mapper if options.mapper != "auto" else _automatic_mapper(course, material, options)
     on_stage("mapping")
     start = time.perf_counter()
-    run = full_size(run_mapper(mapper, material, options), material)
+    memory = KeptGrowth(workspace)
+    run = full_size(run_mapper(mapper, material, options, memory), material)
     seconds = {**material.seconds, "mapping": time.perf_counter() - start}
     on_stage("writing")
     start = time.perf_counter()
@@ -115,6 +118,7 @@ def _reconstruct(
         record["masks_folder"] = Path(os.path.relpath(options.matching.masks.resolve(), out.resolve())).as_posix()
     write_json(out / "run.json", record)
     write_report(out)
+    memory.forget()
     return record
 
 
@@ -149,7 +153,9 @@ def _components_of_earlier_run(out: Path) -> int:
         return 0
 
 
-def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) -> MappingRun:
+def run_mapper(
+    mapper: Mapper, material: Material, options: ReconstructOptions, memory: GrowthMemory | None = None
+) -> MappingRun:
     """One of the mappers on the same material."""
     graph, cameras, camera_of_image = material.graph, material.cameras, material.camera_of_image
     if mapper == "textbook":
@@ -158,7 +164,9 @@ def run_mapper(mapper: Mapper, material: Material, options: ReconstructOptions) 
     if not graph.two_views:  # given matches
         graph = _verified(material, options)
     automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
-    return map_automatic(graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look)
+    return map_automatic(
+        graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look, memory
+    )
 
 
 def _automatic_mapper(course: bool, material: Material, options: ReconstructOptions) -> Mapper:

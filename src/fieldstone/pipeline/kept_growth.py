@@ -1,0 +1,36 @@
+"""States of growing models on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fieldstone.io.workspace import Unit, Workspace, code_version, key_of
+
+STAGE = "growth"
+
+
+@dataclass(frozen=True)
+class KeptGrowth:
+    """A `mapping.growth_memory.GrowthMemory` over the workspace of a run."""
+
+    workspace: Workspace
+
+    def find(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """Arrays and facts of the last state."""
+        unit = self.workspace.find(STAGE, name)
+        return None if unit is None else (dict(unit.arrays), dict(unit.facts))
+
+    def keep(self, name: str, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
+        """Replace the last state."""
+        self.workspace.keep(STAGE, name, Unit(arrays, facts))
+
+    def name_of(self, *parts: Any) -> str:
+        """A name for plain values, option dataclasses and arrays: equal parts, equal names."""
+        return key_of(code_version(), *parts)
+
+    def forget(self) -> None:
+        """Delete all states: the models are finished and written."""
+        self.workspace.forget_others(STAGE, [])
