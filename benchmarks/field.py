@@ -147,7 +147,9 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
         rows.append((f"scatter level {resolution}", best(lambda level=level: scatter(level))))
     for level in range(levels - plan.immediate_levels):
         scatter(level)
-    rows.append(("step touched blocks", best(step, before=lambda: [scatter(k) for k in range(levels - 1)])))
+    rows.append(
+        ("step touched blocks", best(step, before=lambda: [scatter(k) for k in range(levels - plan.immediate_levels)]))
+    )
     about = f"{num_rays} rays, {asked / num_rays:.1f} steps asked and {n / num_rays:.1f} samples that weigh per ray"
     return [(name, seconds / n * 1e9) for name, seconds in rows], about
 

@@ -135,6 +135,14 @@ LARGE_BATCHES = ((30.0, 2048), (240.0, 4096))
 """Budgets in seconds from which a chunk has so many samples: the noise of small batches is what long runs end in."""
 
 
+SMALL_FINEST = 160
+"""Up to so many cells, many samples of a batch meet in a vertex of the finest level: moving it by each of them is
+noise, by their sum is not."""
+
+SMALL_FINAL_RATE = 0.03
+"""Final share of the rates on such grids: every ray is seen many times, and what the last ones say is noise."""
+
+
 def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
     """The settings for a kind of scene and a budget, with steps that are still to be planned.
 
@@ -145,6 +153,8 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
     steps = (1000,) * len(STAGE_SHARES)
     room = max([1024, *(samples for from_s, samples in LARGE_BATCHES if budget_s >= from_s)])
     if bounded:
+        if finest <= SMALL_FINEST:
+            return FastPlan(finest, steps, samples_per_chunk=room, final_rate=SMALL_FINAL_RATE, immediate_levels=0)
         return FastPlan(finest, steps, samples_per_chunk=room)
     return FastPlan(
         finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
