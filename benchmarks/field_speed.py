@@ -1,0 +1,103 @@
+"""How fast fields are shown and learned: frames per second by size, and seconds until a training PSNR by field.
+
+    python -m benchmarks.field_speed SCENE OUT [--sizes 100,200,400,800] [--threads 2]
+    python -m benchmarks.field_speed SCENE OUT --networks 120 [--target-db 25]
+
+SCENE is any source of `fieldstone train`, OUT a folder that it trained a fast field in (with `curve.json`). Frames are
+those of the training photos; CPU seconds are of all threads together, and on a busy machine the better measure: a
+frame takes at least their share of each thread. With --networks, the small network of the course and the original NeRF
+are trained for so many seconds each: a time until the target that they do not reach is more than that. PSNR is that of
+the last 20 batches of training rays, for the fast field only those that meet the object, which are the harder ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from fieldstone.field.fast_field import field_from_tensors, renderer
+from fieldstone.field.radiance_field import in_world
+from fieldstone.field.training import PRESETS, train
+from fieldstone.io.checkpoint import read_checkpoint
+from fieldstone.pipeline.field_input import read_ray_dataset
+from fieldstone.pipeline.field_mesh import compared_views
+from fieldstone.pipeline.fields import frame_from_header, open_training, split_tensors
+from fieldstone.render.views import render_view
+
+FRAMES = 12
+BATCHES = 20
+
+
+def main() -> None:
+    """Frames per second, then, if asked for, the networks."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--sizes", default="100,200,400,800")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--networks", type=float, default=0.0)
+    parser.add_argument("--target-db", type=float, default=25.0)
+    arguments = parser.parse_args()
+    for size in map(int, arguments.sizes.split(",")):
+        wall, cpu = frame_seconds(arguments.out, size, arguments.threads)
+        show(
+            f"{size:5d} px: {1 / wall:6.1f} frames/s ({1e3 * cpu:6.1f} ms of CPU a frame, {arguments.threads} threads)"
+        )
+    if arguments.networks <= 0:
+        return
+    curve = json.loads((arguments.out / "curve.json").read_text())
+    report("fast", [p["seconds"] for p in curve], [p["psnr"] for p in curve], arguments.target_db)
+    for name in ("tiny", "nerf"):
+        seconds, psnr = network_curve(arguments.scene, name, arguments.networks, arguments.threads)
+        report(name, seconds, psnr, arguments.target_db)
+
+
+def frame_seconds(out: Path, size: int, threads: int) -> tuple[float, float]:
+    """Wall and CPU seconds of a frame of a trained fast field, kernels compiled."""
+    tensors, header = read_checkpoint(out / "checkpoint.safetensors")
+    poses, state = split_tensors(tensors)
+    frame = frame_from_header(header)
+    with ThreadPoolExecutor(threads) as executor:
+        render = in_world(renderer(field_from_tensors(state), frame, executor), frame)
+        views = compared_views(header, poses, FRAMES, size)
+        render_view(render, *views[0])
+        wall, cpu = time.perf_counter(), time.process_time()
+        for camera, pose in views:
+            render_view(render, camera, pose)
+        return (time.perf_counter() - wall) / len(views), (time.process_time() - cpu) / len(views)
+
+
+def network_curve(scene: Path, name: str, budget_s: float, threads: int) -> tuple[list[float], list[float]]:
+    """Seconds and training PSNR of every step of a classical network."""
+    options = PRESETS[name]
+    dataset = read_ray_dataset(scene, None, options.image_size_px)
+    with open_training(options, dataset.frame, dataset, seed=0, device="cpu", threads=threads) as training:
+        _, curve = train(training, training.start(), budget_s=budget_s)
+    return [p.seconds for p in curve], [p.psnr for p in curve]
+
+
+def report(name: str, seconds: Sequence[float], psnr: Sequence[float], target: float) -> None:
+    """When the mean of the last batches reached the target, and what it came to."""
+    mean = (
+        np.convolve(psnr, np.full(BATCHES, 1 / BATCHES), "valid") if len(psnr) >= BATCHES else np.array([np.mean(psnr)])
+    )
+    reached = np.flatnonzero(mean >= target)
+    when = f"{target:g} dB after {seconds[reached[0] + len(psnr) - len(mean)]:.1f} s" if len(reached) else "not reached"
+    show(f"{name:5s}: {when}; best {mean.max():.2f} dB in {seconds[-1]:.0f} s, {len(psnr)} steps")
+
+
+def show(line: str) -> None:
+    """One line of the result."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
