@@ -106,7 +106,9 @@ def test_gradient_of_the_network_by_central_differences(options):
     assert torch.autograd.gradcheck(value, inputs, eps=1e-6, atol=1e-8, rtol=1e-5, fast_mode=True)
 
 
-@pytest.mark.parametrize("options", [SMALL_TINY, SMALL_NERF], ids=["tiny", "nerf"])
+@pytest.mark.parametrize(
+    "options", [pytest.param(SMALL_TINY, id="tiny"), pytest.param(SMALL_NERF, id="nerf", marks=pytest.mark.slow)]
+)
 def test_gradient_of_rendered_colours_by_central_differences(options):
     """Encodings, network and volume rendering together, and both networks where there are two."""
     count = 2 if options.num_fine_samples else 1

@@ -87,6 +87,7 @@ def test_a_place_looks_the_same_in_every_photo(house):
     assert np.median(np.abs(here - there)) < 12
 
 
+@pytest.mark.slow
 def test_photos_do_not_depend_on_the_number_of_threads(photos):
     again = make_photos(SMALL, np.random.default_rng(0), threads=1)
     for a, b in zip(photos.images, again.images, strict=True):
