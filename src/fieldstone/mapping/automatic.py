@@ -18,7 +18,7 @@ from fieldstone.mapping.growth_memory import GrowthMemory
 from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
 from fieldstone.mapping.point_update import drop_outliers
 from fieldstone.mapping.record import Drop, MappingRun, StageRecord
-from fieldstone.mapping.refinement import adjust, refine_until_stable
+from fieldstone.mapping.refinement import RefinementOptions, adjust, loss_scale, refine_until_stable
 from fieldstone.mapping.registration import verdict_of_pairs
 from fieldstone.mapping.rescue import MoreMatches, rescue
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
@@ -59,6 +59,8 @@ class Finished:
     drops: list[Drop]
     trials: list[CalibrationTrial]
     calibration: tuple[CalibrationStep | None, ...]
+    refinement: RefinementOptions
+    """Of the last adjustments."""
 
 
 def map_automatic(
@@ -111,8 +113,7 @@ def _map_components(
     records: list[StageRecord] = record_views(best.before, graph.names, "before BA")
     records += record_views(best.model, graph.names, "after BA")
     start = grown[0].initial_pair
-    refinement = options.incremental.refinement
-    uncertainty = model_uncertainty(best.model, best.calibration, refinement) if options.covariance else None
+    uncertainty = model_uncertainty(best.model, best.calibration, best.refinement) if options.covariance else None
     initial = four_poses(graph, start, start_cameras, camera_of_image)
     return MappingRun(
         to_reconstruction(best.model, graph),
@@ -130,7 +131,8 @@ def _map_components(
 
 def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generator) -> Finished:
     """Self-calibration, then adjustment of everything with everything."""
-    incremental, refinement = options.incremental, options.incremental.refinement
+    incremental = options.incremental
+    refinement = incremental.refinement.for_noise(loss_scale(grown.model))
     before = grown.model
     calibration, trials = climb(grown.model, grown.calibration, refinement, options.self_calibration, rng)
     model = refine_until_stable(
@@ -147,8 +149,8 @@ def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generato
     model, more = drop_outliers(model, "last adjustment", incremental.max_error_px, options.min_angle_deg)
     if collapsed(before, model):
         logger.warning("the last adjustment made the model fall apart: it is left as it had grown")
-        return Finished(before, before, [], trials, grown.calibration)
-    return Finished(model, before, drops + more, trials, calibration)
+        return Finished(before, before, [], trials, grown.calibration, incremental.refinement)
+    return Finished(model, before, drops + more, trials, calibration, refinement)
 
 
 def _verdicts(graph: MatchGraph, grown: list[GrownModel], models: list[WorkingModel]) -> dict[str, str]:

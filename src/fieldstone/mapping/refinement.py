@@ -11,10 +11,14 @@ from jaxtyping import Bool, Int
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.calibration import CalibrationStep, priors, with_models
 from fieldstone.mapping.growth import covering_tracks, retriangulate
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.working_model import WorkingModel, reprojections
 from fieldstone.solve.bundle import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle_problem import BundleProblem
 
+CAUCHY_SIGMAS = 2.385
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""Median length of a 2-vector whose coordinates are normal with standard deviation 1."""
+LOSS_SCALES_PX = (0.25, 2.0)
 MIN_OBSERVATIONS_FOR_THREADS = 10_000
 """Smaller adjustments take less time than threads cost."""
 
@@ -39,16 +43,20 @@ class RefinementOptions:
     """Adjustments while the model grows."""
     final: BundleOptions = field(
         default_factory=lambda: BundleOptions(
-            loss="cauchy", loss_scale_px=0.5, max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
+            loss="cauchy", max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
         )
     )
-    """The last adjustments; residuals of SIFT keypoints have tails that are even heavier than those of this loss."""
+    """The last adjustments; residuals of SIFT keypoints have heavy tails. The scale of the loss follows their noise."""
     min_views_for_intrinsics: int = 3
     """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
     max_rounds: int = 4
     """Rounds of adjustment and triangulation at the end."""
     threads: int = 1
     """Threads of an adjustment; results are the same for any number."""
+
+    def for_noise(self, scale_px: float) -> RefinementOptions:
+        """The same with another scale of the loss of the last adjustments."""
+        return replace(self, final=replace(self.final, loss_scale_px=scale_px))
 
 
 Calibration = Sequence[CalibrationStep | None]
@@ -107,6 +115,19 @@ def refine_until_stable(
         if changed < 1e-3 * len(before):
             break
     return model
+
+
+def loss_scale(model: WorkingModel) -> float:
+    """Where a Cauchy loss should bend, in working pixels, for the noise of a model's observations.
+
+    It then loses 5 % of the efficiency of least squares if the noise is normal, and wins if its tails are heavier.
+
+    Source:
+        `holland1977`.
+    """
+    errors = reprojections(model).errors
+    sigma = float(np.median(errors)) / MEDIAN_OF_RAYLEIGH if len(errors) else 1.0
+    return float(np.clip(CAUCHY_SIGMAS * sigma, *LOSS_SCALES_PX))
 
 
 def _solve(

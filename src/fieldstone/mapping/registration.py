@@ -13,7 +13,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
 from fieldstone.geometry.triangulation import in_front_of_both, triangulate_linear, triangulation_angles
 from fieldstone.mapping.working_model import WorkingModel
-from fieldstone.scene.match_graph import ImagePair, MatchGraph
+from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.absolute_pose import estimate_absolute_pose
 from fieldstone.solve.ransac import RansacOptions
 
@@ -21,6 +21,8 @@ BEST_START_ANGLE_DEG = 20.0
 """Wider rays than these make a start no better."""
 MAX_TURN = np.deg2rad(15.0)
 """Pairs whose rotation differs by more from that of the model contradict it."""
+MAX_DOUBT = 0.2
+"""Larger shares of matches that contradict a model tell of wrong cameras: false pairs were taken out before."""
 ANGLE_SAMPLES = 200
 """Matches of a pair whose angles are looked at."""
 
@@ -104,22 +106,49 @@ def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_fro
     """Why a pose of a photo cannot be, or an empty text.
 
     Most matches with registered photos ask for another rotation, or there are none: where a scene repeats itself, a
-    few false matches turn the points of one place into those of another.
+    few false matches turn the points of one place into those of another. Where many matches among the registered
+    photos do so, pairs say nothing: their rotations come from cameras that the model has since refined.
     """
+    partners = _registered_partners(model, graph, view)
+    if not partners:
+        return "none of its photos has matches with this one"
+    agree, differ = _agreement(model, graph, view, cam_from_world, partners)
+    if differ <= agree:
+        return ""
+    registered = np.flatnonzero(model.registered_mask()).tolist()
+    of_others = [
+        _agreement(model, graph, v, model.pose_of(v), _registered_partners(model, graph, v)) for v in registered
+    ]
+    all_agree, all_differ = np.sum(of_others, axis=0)
+    if all_differ > MAX_DOUBT * (all_agree + all_differ):
+        return ""
+    return f"{differ} of {agree + differ} matches with its photos ask for another rotation"
+
+
+def _registered_partners(model: WorkingModel, graph: MatchGraph, view: int) -> list[int]:
+    """Registered photos that a photo has verified matches with."""
+    partners = [j if view == i else i for i, j in graph.two_views if view in (i, j)]
+    return [p for p in partners if model.poses[p] is not None and _two_view(graph, view, p).inliers.any()]
+
+
+def _two_view(graph: MatchGraph, a: int, b: int) -> TwoView:
+    return graph.two_views[min(a, b), max(a, b)]
+
+
+def _agreement(
+    model: WorkingModel, graph: MatchGraph, view: int, cam_from_world: Rigid3, partners: Sequence[int]
+) -> tuple[int, int]:
+    """Matches of pairs that agree with a photo's rotation, or tell nothing of it; and of those that do not."""
     agree, differ = 0, 0
-    for (i, j), two_view in graph.two_views.items():
-        partner = j if view == i else i
-        if view not in (i, j) or model.poses[partner] is None:
-            continue
+    for partner in partners:
+        two_view = _two_view(graph, view, partner)
         pose, inliers = two_view.cam2_from_cam1, int(two_view.inliers.sum())
-        R = None if pose is None else (pose.R if view == j else pose.R.T) @ model.pose_of(partner).R
+        R = None if pose is None else (pose.R if view > partner else pose.R.T) @ model.pose_of(partner).R
         if R is None or angle_between(R, cam_from_world.R) < MAX_TURN:
             agree += inliers
         else:
             differ += inliers
-    if differ > agree:
-        return f"{differ} of {agree + differ} matches with its photos ask for another rotation"
-    return "" if agree else "none of its photos has matches with this one"
+    return agree, differ
 
 
 def verdict_of_pairs(graph: MatchGraph, view: int) -> str:

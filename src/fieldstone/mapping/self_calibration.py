@@ -35,15 +35,8 @@ class SelfCalibrationOptions:
     """Predictions that are further off count as just this bad."""
     min_judges: int = 100
     """With fewer predictions nothing is decided, and the calibration stays as it is."""
-    loss_scale_px: float = 0.5
-    """Errors beyond it count ever less: they tell of false matches rather than of cameras."""
     principal_point: bool = True
     """Whether steps that move the principal point are on the ladder."""
-
-    def badness(self, errors_px: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-        """Robust squared errors, in squared pixels."""
-        rho, _ = cauchy(self.loss_scale_px)(np.minimum(errors_px, self.max_error_px) ** 2)
-        return rho
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,12 @@ def climb(
     best = tuple(calibration)
     above = [() if step is None else steps_above(step, principal_point=options.principal_point) for step in calibration]
     fitted = adjust(model, refinement, best, bundle=refinement.final, points=learners)
-    errors = options.badness(prediction_errors(fitted, rows, predictions))
+    loss = cauchy(refinement.final.loss_scale_px)
+
+    def badness(model: WorkingModel) -> Float[np.ndarray, "k"]:
+        return loss(np.minimum(prediction_errors(model, rows, predictions), options.max_error_px) ** 2)[0]
+
+    errors = badness(fitted)
     trials: list[CalibrationTrial] = []
     refused = 0
     for step in LADDER:
@@ -92,7 +90,7 @@ def climb(
         if candidate == best or (refused == 2 and not of_another_kind):
             continue
         richer = adjust(fitted, refinement, candidate, bundle=refinement.final, points=learners)
-        new_errors = options.badness(prediction_errors(richer, rows, predictions))
+        new_errors = badness(richer)
         gain = errors - new_errors
         significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
         clear = gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance
