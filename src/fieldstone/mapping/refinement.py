@@ -43,10 +43,11 @@ class RefinementOptions:
     """Adjustments while the model grows."""
     final: BundleOptions = field(
         default_factory=lambda: BundleOptions(
-            loss="cauchy", max_iterations=50, relative_tolerance=1e-6, keep_gauge=True
+            loss="cauchy", max_iterations=50, relative_tolerance=3e-5, keep_gauge=True
         )
     )
-    """The last adjustments; residuals of SIFT keypoints have heavy tails. The scale of the loss follows their noise."""
+    """The last adjustments; residuals of SIFT keypoints have heavy tails. The scale of the loss follows their noise.
+    Reweighting converges slowly: steps that gain less move poses by a thousandth of their error."""
     min_views_for_intrinsics: int = 3
     """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
     max_rounds: int = 4

@@ -18,6 +18,8 @@ from fieldstone.solve.bundle_covariance import bundle_covariance
 def model_uncertainty(model: WorkingModel, calibration: Calibration, options: RefinementOptions) -> Uncertainty:
     """The covariances at the minimum that `refine_until_stable` has found, in the gauge of least variance.
 
+    Observations count with the weights of the robust loss, which makes the covariances somewhat too large.
+
     Raises:
         ValueError: The model has so many photos that the dense inverse would not fit.
     """
