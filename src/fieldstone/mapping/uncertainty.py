@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +13,17 @@ from fieldstone.mapping.calibration import priors
 from fieldstone.mapping.record import Uncertainty
 from fieldstone.mapping.refinement import Calibration, RefinementOptions, bundle_problem
 from fieldstone.mapping.working_model import WorkingModel, reprojections
+from fieldstone.solve.bundle import BundleOptions
 from fieldstone.solve.bundle_covariance import bundle_covariance
+from fieldstone.solve.robust_loss import RobustLoss, cauchy, huber, soft_l1, trivial
+
+LOSSES: dict[str, Callable[[float], RobustLoss]] = {
+    "trivial": lambda _: trivial(), "huber": huber, "soft_l1": soft_l1, "cauchy": cauchy
+}  # fmt: skip
 
 
 def model_uncertainty(model: WorkingModel, calibration: Calibration, options: RefinementOptions) -> Uncertainty:
     """The covariances at the minimum that `refine_until_stable` has found, in the gauge of least variance.
-
-    Observations count with the weights of the robust loss, which makes the covariances somewhat too large.
 
     Raises:
         ValueError: The model has so many photos that the dense inverse would not fit.
@@ -31,11 +36,29 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
     freedoms -= int(sum(mask.sum() for mask in problem.refine))
     sigma_px = float(np.sqrt(np.sum(errors**2) / max(freedoms, 1)))
     bundle = replace(options.final, camera_priors=priors(problem.cameras, calibration))
-    found = bundle_covariance(problem, bundle, sigma_px=sigma_px)
+    found = bundle_covariance(problem, bundle, sigma_px=sigma_px * robust_factor(errors, bundle))
     of_views = np.full((model.num_views, 6, 6), np.nan)
     of_views[registered] = found.of_views
     rotation = np.rad2deg(np.sqrt(np.trace(of_views[:, :3, :3], axis1=1, axis2=2)))
     return Uncertainty(of_views, found.of_points, sigma_px, rotation, _of_centers(model, of_views))
+
+
+def robust_factor(errors_px: Float[np.ndarray, "o"], options: BundleOptions) -> float:
+    """By what to multiply the noise so that the inverse of J^T W J, W the weights of a robust loss, is a covariance.
+
+    The covariance of an M-estimator is b / a^2 (J^T J)^-1, with b = E psi^2 and a = E psi', and J^T W J is about
+    E w J^T J: without the factor what a loss takes from ordinary observations would count as missing.
+
+    Source:
+        `huber1981`, section 7.6.
+    """
+    squared = errors_px**2
+    loss = LOSSES[options.loss](options.loss_scale_px)
+    weight = loss(squared)[1]
+    step = 1e-4
+    slope = weight + (loss(squared * (1 + step))[1] - weight) / step  # half the divergence of weight * residual
+    share = np.mean(weight**2 * squared) * np.mean(weight) / max(float(np.mean(squared)), 1e-300)
+    return float(np.sqrt(share) / np.mean(slope))
 
 
 def _of_centers(model: WorkingModel, of_views: Float[np.ndarray, "v 6 6"]) -> Float[np.ndarray, "v"]:
