@@ -140,6 +140,21 @@ def test_gps_in_signed_degrees(tmp_path):
     assert broken.gps is None
 
 
+@pytest.mark.parametrize(("suffix", "at_least_px", "width"), [("jpg", 100, 160), ("jpg", 161, 320), ("png", 100, 640)])
+def test_a_photo_that_is_shown_small_is_decoded_small(tmp_path, suffix, at_least_px, width):
+    """A JPEG at 1/2, 1/4 or 1/8 of its size, and turned all the same; its facts stay those of the whole photo."""
+    ramp = np.linspace(0, 255, 640)[None, :, None] * np.ones((480, 1, 3))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(ramp.astype(np.uint8)).save(path, exif=exif)
+    photo = read_photo(path, at_least_px=at_least_px)
+    assert photo.rgb.shape == (width, 3 * width // 4, 3)
+    assert (photo.info.width, photo.info.height) == (480, 640)
+    expected = np.asarray(Image.fromarray(read_photo(path).rgb).resize((3 * width // 4, width), Image.Resampling.BOX))
+    np.testing.assert_allclose(photo.rgb.astype(float), expected, atol=4)
+
+
 def test_photos_are_listed_in_natural_order(tmp_path):
     for name in ["img10.png", "img2.png", "IMG1.JPG", "._img3.png", "notes.txt", "img2b.png"]:
         (tmp_path / name).write_bytes(b"")

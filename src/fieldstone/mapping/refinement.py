@@ -16,9 +16,11 @@ from fieldstone.solve.bundle import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle_problem import BundleProblem
 
 CAUCHY_SIGMAS = 2.385
+"""Where a Cauchy loss has 95 % of the efficiency of least squares under normal noise."""
 MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a 2-vector whose coordinates are normal with standard deviation 1."""
 LOSS_SCALES_PX = (0.25, 2.0)
+"""Keypoints are hardly better than a tenth of a pixel, and what is worse than a pixel is no noise."""
 MIN_OBSERVATIONS_FOR_THREADS = 10_000
 """Smaller adjustments take less time than threads cost."""
 

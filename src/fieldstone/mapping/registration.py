@@ -12,6 +12,7 @@ from fieldstone.geometry.camera import plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
 from fieldstone.geometry.triangulation import in_front_of_both, triangulate_linear, triangulation_angles
+from fieldstone.mapping.rotation_forest import AGREE
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.absolute_pose import estimate_absolute_pose
@@ -19,8 +20,6 @@ from fieldstone.solve.ransac import RansacOptions
 
 BEST_START_ANGLE_DEG = 20.0
 """Wider rays than these make a start no better."""
-MAX_TURN = np.deg2rad(15.0)
-"""Pairs whose rotation differs by more from that of the model contradict it."""
 MAX_DOUBT = 0.2
 """Larger shares of matches that contradict a model tell of wrong cameras: false pairs were taken out before."""
 ANGLE_SAMPLES = 200
@@ -144,7 +143,7 @@ def _agreement(
         two_view = _two_view(graph, view, partner)
         pose, inliers = two_view.cam2_from_cam1, int(two_view.inliers.sum())
         R = None if pose is None else (pose.R if view > partner else pose.R.T) @ model.pose_of(partner).R
-        if R is None or angle_between(R, cam_from_world.R) < MAX_TURN:
+        if R is None or angle_between(R, cam_from_world.R) < AGREE:
             agree += inliers
         else:
             differ += inliers

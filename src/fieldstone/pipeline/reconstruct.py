@@ -97,7 +97,13 @@ def _reconstruct(
         material = read_course(source)
     else:
         material = match_photos(source, options.matching, options.seed, on_stage, workspace)
-    mapper = options.mapper if options.mapper != "auto" else _automatic_mapper(course, material, options)
+    mapper = options.mapper if options.mapper != "auto" else "incremental"
+    if course and options.mapper != "textbook":
+        verified = replace(material, graph=_verified(material, options))
+        if options.mapper == "auto" and not _look_alike(verified):
+            mapper = "textbook"  # on the matches as given
+        else:
+            material = verified
     on_stage("mapping")
     start = time.perf_counter()
     memory = KeptGrowth(workspace)
@@ -161,20 +167,16 @@ def run_mapper(
     if mapper == "textbook":
         textbook = replace(options.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
-    if not graph.two_views:  # given matches
-        graph = _verified(material, options)
     automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
     return map_automatic(
         graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look, memory
     )
 
 
-def _automatic_mapper(course: bool, material: Material, options: ReconstructOptions) -> Mapper:
-    """The textbook mapper for given matches, unless places in them look alike: it knows of one place only."""
-    if not course:
-        return "incremental"
-    resolution = resolve_ambiguity(_verified(material, options), material.cameras, material.camera_of_image)
-    return "incremental" if resolution.left_out.any() else "textbook"
+def _look_alike(verified: Material) -> bool:
+    """Whether pairs of different places match falsely: the textbook mapper knows of one place only."""
+    resolution = resolve_ambiguity(verified.graph, verified.cameras, verified.camera_of_image)
+    return bool(resolution.left_out.any())
 
 
 def _verified(material: Material, options: ReconstructOptions) -> MatchGraph:

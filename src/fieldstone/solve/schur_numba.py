@@ -245,6 +245,29 @@ def reduce_border_numba(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def views_of_point_numba(start, stop, d0, d1, d2, slot, Z, x):
+    """Sum of Z_i x_i over the views i of the observations `start` to `stop` of a point; d = point - pivot."""
+    u0, u1, u2 = 0.0, 0.0, 0.0
+    for o in range(start, stop):
+        i = slot[o]
+        if i < 0:
+            continue
+        w0, w1, w2 = x[i, 0], x[i, 1], x[i, 2]
+        m0 = x[i, 3] + w1 * d2 - w2 * d1  # (d x h) omega + h v = h (v + omega x d)
+        m1 = x[i, 4] + w2 * d0 - w0 * d2
+        m2 = x[i, 5] + w0 * d1 - w1 * d0
+        u0 += Z[o, 0, 0] * m0 + Z[o, 0, 1] * m1 + Z[o, 0, 2] * m2
+        u1 += Z[o, 1, 0] * m0 + Z[o, 1, 1] * m1 + Z[o, 1, 2] * m2
+        u2 += Z[o, 2, 0] * m0 + Z[o, 2, 1] * m1 + Z[o, 2, 2] * m2
+        for a in range(3, Z.shape[2]):
+            u0 += Z[o, 0, a] * x[i, 3 + a]
+            u1 += Z[o, 1, a] * x[i, 3 + a]
+            u2 += Z[o, 2, a] * x[i, 3 + a]
+    return u0, u1, u2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def move_points_numba(
     start, stop, slot, point_start, entry_start, entry_camera, num_active, border_of_camera, points, pivot,
     V, g_point, damping, L_inv, y, Z, Z_border, dx, dx_border, points_new, decrease,
@@ -256,20 +279,10 @@ def move_points_numba(
     for p in range(start, stop):
         u0, u1, u2 = y[p, 0], y[p, 1], y[p, 2]
         d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
-        for o in range(point_start[p], point_start[p + 1]):
-            i = slot[o]
-            if i >= 0:
-                w0, w1, w2 = dx[i, 0], dx[i, 1], dx[i, 2]
-                m0 = dx[i, 3] + w1 * d2 - w2 * d1  # (d x h) omega + h v = h (v + omega x d)
-                m1 = dx[i, 4] + w2 * d0 - w0 * d2
-                m2 = dx[i, 5] + w0 * d1 - w1 * d0
-                u0 += Z[o, 0, 0] * m0 + Z[o, 0, 1] * m1 + Z[o, 0, 2] * m2
-                u1 += Z[o, 1, 0] * m0 + Z[o, 1, 1] * m1 + Z[o, 1, 2] * m2
-                u2 += Z[o, 2, 0] * m0 + Z[o, 2, 1] * m1 + Z[o, 2, 2] * m2
-                for a in range(3, Z.shape[2]):
-                    u0 += Z[o, 0, a] * dx[i, 3 + a]
-                    u1 += Z[o, 1, a] * dx[i, 3 + a]
-                    u2 += Z[o, 2, a] * dx[i, 3 + a]
+        v0, v1, v2 = views_of_point_numba(point_start[p], point_start[p + 1], d0, d1, d2, slot, Z, dx)
+        u0 += v0
+        u1 += v1
+        u2 += v2
         for e in range(entry_start[p], entry_start[p + 1]):
             c = entry_camera[e]
             for a in range(num_active[c]):

@@ -6,6 +6,8 @@ from typing import no_type_check
 
 from numba import njit
 
+from fieldstone.solve.schur_numba import views_of_point_numba
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
@@ -13,23 +15,7 @@ def points_of_views_numba(start, stop, slot, point_start, points, pivot, Z, x, w
     """w (p, 3) = sum of Z_i x_i over the views i of each point from `start` to `stop`; x (s, block)."""
     for p in range(start, stop):
         d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
-        u0, u1, u2 = 0.0, 0.0, 0.0
-        for o in range(point_start[p], point_start[p + 1]):
-            i = slot[o]
-            if i < 0:
-                continue
-            w0, w1, w2 = x[i, 0], x[i, 1], x[i, 2]
-            m0 = x[i, 3] + w1 * d2 - w2 * d1  # (d x h) omega + h v = h (v + omega x d)
-            m1 = x[i, 4] + w2 * d0 - w0 * d2
-            m2 = x[i, 5] + w0 * d1 - w1 * d0
-            u0 += Z[o, 0, 0] * m0 + Z[o, 0, 1] * m1 + Z[o, 0, 2] * m2
-            u1 += Z[o, 1, 0] * m0 + Z[o, 1, 1] * m1 + Z[o, 1, 2] * m2
-            u2 += Z[o, 2, 0] * m0 + Z[o, 2, 1] * m1 + Z[o, 2, 2] * m2
-            for a in range(3, Z.shape[2]):
-                u0 += Z[o, 0, a] * x[i, 3 + a]
-                u1 += Z[o, 1, a] * x[i, 3 + a]
-                u2 += Z[o, 2, a] * x[i, 3 + a]
-        w[p, 0], w[p, 1], w[p, 2] = u0, u1, u2
+        w[p, 0], w[p, 1], w[p, 2] = views_of_point_numba(point_start[p], point_start[p + 1], d0, d1, d2, slot, Z, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
