@@ -68,17 +68,7 @@ def mesh_run(
     Raises:
         InputError: No fast field in `out`, or nothing solid in it.
     """
-    if not 0 < level < 1:
-        raise InputError(f"--level must lie between 0 and 1, got {level:g}")
-    if cells is not None and cells < 2:
-        raise InputError(f"--cells must be at least 2, got {cells}")
-    tensors, header = read_checkpoint(out / CHECKPOINT)
-    if header["field"] != "fast":
-        raise InputError(
-            f"{out}: a mesh needs the fast field, not the {header['field']} network; train without --field"
-        )
-    poses, state_tensors = split_tensors(tensors)
-    field, frame = field_from_tensors(state_tensors), frame_from_header(header)
+    field, frame, poses, header = solid_field(out, "a mesh", cells, level)
     on_stage("extracting the surface")
     mesh, floaters = normalized_mesh(field, frame, poses, cells, level)
     world = frame.normalized_from_world.inverse()
@@ -98,6 +88,31 @@ def mesh_run(
         }
     write_json(out / MESH, record)
     return record
+
+
+def solid_field(
+    out: Path, purpose: str, cells: int | None, level: float
+) -> tuple[FastField, FieldFrame, Rigid3, dict[str, Any]]:
+    """The fast field that training left in `out`, its frame, the training poses and the checkpoint's facts.
+
+    Args:
+        purpose: What it is wanted for, as messages say.
+        cells: See `mesh_run`, as level.
+
+    Raises:
+        InputError: No fast field in `out`, or cells or level that make no surface.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"--level must lie between 0 and 1, got {level:g}")
+    if cells is not None and cells < 2:
+        raise InputError(f"--cells must be at least 2, got {cells}")
+    tensors, header = read_checkpoint(out / CHECKPOINT)
+    if header["field"] != "fast":
+        raise InputError(
+            f"{out}: {purpose} needs the fast field, not the {header['field']} network; train without --field"
+        )
+    poses, state = split_tensors(tensors)
+    return field_from_tensors(state), frame_from_header(header), poses, header
 
 
 def normalized_mesh(

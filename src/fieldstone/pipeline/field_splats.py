@@ -12,19 +12,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr, quantize
 from fieldstone.field.fast_decoder import decode
-from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
+from fieldstone.field.fast_field import FastField, renderer
 from fieldstone.field.fast_grid_numba import interpolate_numba
 from fieldstone.field.projection import project_points
 from fieldstone.field.radiance_field import FieldFrame, in_world
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.atomic import write_json
-from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.io.splats import write_splats
-from fieldstone.pipeline.field_mesh import compared_views, normalized_mesh
-from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
+from fieldstone.pipeline.field_mesh import compared_views, normalized_mesh, solid_field
 from fieldstone.render.splat_view_numba import splat_view
 from fieldstone.render.splatting import splats_of_surface
 from fieldstone.render.views import render_view
@@ -59,15 +56,7 @@ def splat_run(
     Raises:
         InputError: No fast field in `out`, or nothing solid in it.
     """
-    if not 0 < level < 1:
-        raise InputError(f"--level must lie between 0 and 1, got {level:g}")
-    if cells is not None and cells < 2:
-        raise InputError(f"--cells must be at least 2, got {cells}")
-    tensors, header = read_checkpoint(out / CHECKPOINT)
-    if header["field"] != "fast":
-        raise InputError(f"{out}: splats need the fast field, not the {header['field']} network; train without --field")
-    poses, state_tensors = split_tensors(tensors)
-    field, frame = field_from_tensors(state_tensors), frame_from_header(header)
+    field, frame, poses, header = solid_field(out, "a file of splats", cells, level)
     on_stage("extracting the surface")
     splats = splats_of_field(field, frame, poses, cells, level)
     write_splats(splats, out / SPLATS)
