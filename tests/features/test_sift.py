@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduce_to, root_sift, spread
+from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduced_grey, root_sift, spread
 
 
 def blob(x: float, y: float, sigma: float, width: int = 180, height: int = 160) -> np.ndarray:
@@ -47,8 +47,8 @@ def test_reduced_photos_give_keypoints_of_the_full_photo():
     nearest = np.argmin(np.linalg.norm(found.keypoints - [x, y], axis=1))
     np.testing.assert_allclose(found.keypoints[nearest], [x, y], atol=0.1)
     assert 0.7 < found.scale[nearest] / 9.0 < 1.1
-    assert reduce_to(image, 500).shape == (355, 500, 3)
-    assert reduce_to(image, 901) is image
+    assert reduced_grey(image, 500).shape == (355, 500)
+    assert reduced_grey(image, 901).shape == (640, 901)
 
 
 def test_angles_turn_with_the_photo():

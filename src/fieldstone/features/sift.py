@@ -12,6 +12,8 @@ from fieldstone.scene.features import Features
 
 DESCRIPTOR_SCALE = 512.0
 """RootSIFT descriptors have unit length; as uint8 they are multiplied by this and clipped at 255."""
+CANDIDATES = 1.6
+"""Times `max_features`: so many of the strongest compete for their place in the photo."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,22 @@ class Sift:
         Args:
             keep: Features whose centre lies elsewhere are left out before the strongest are chosen; None: none is.
         """
-        reduced = reduce_to(image, self.options.max_image_size)
-        grey = cv2.cvtColor(reduced, cv2.COLOR_RGB2GRAY)
+        return self.of_grey(reduced_grey(image, self.options.max_image_size), image, keep)
+
+    def of_grey(
+        self,
+        grey: UInt8[np.ndarray, "g w2"],
+        image: UInt8[np.ndarray, "h w 3"],
+        keep: Bool[np.ndarray, "h w"] | None = None,
+    ) -> Features:
+        """The same, with the photo's `reduced_grey` at hand."""
+        options = self.options
         detector = cv2.SIFT.create(
-            nfeatures=0,
+            # OpenCV does not know of `keep` when it chooses the strongest.
+            nfeatures=round(CANDIDATES * options.max_features) if keep is None else 0,
             nOctaveLayers=3,
-            contrastThreshold=self.options.contrast_threshold,
-            edgeThreshold=self.options.edge_threshold,
+            contrastThreshold=options.contrast_threshold,
+            edgeThreshold=options.edge_threshold,
             sigma=1.6,
             descriptorType=cv2.CV_8U,
             # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
@@ -72,7 +83,8 @@ class Sift:
         )
         # Each axis of the photo was reduced by its own, rounded, factor.
         zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
-        found = detector.detect(grey, None)
+        # In one call, since a pyramid costs as much as thousands of descriptors.
+        found, described = detector.detectAndCompute(grey, None)
         if not found:
             return _no_features()
         # OpenCV: centre of the first pixel at (0, 0), diameters, degrees.
@@ -84,30 +96,27 @@ class Sift:
         allowed = np.arange(len(xy)) if keep is None else np.flatnonzero(at_pixels(keep, xy * zoom))
         if not len(allowed):
             return _no_features()
-        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, self.options)]
+        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, options)]
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
-        # Only these are described: a second pyramid costs less than thousands of descriptors that nobody needs.
-        kept, descriptors = detector.compute(grey, [found[k] for k in order])
-        assert descriptors is not None
-        assert len(kept) == len(order)
         pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
         return Features(
             keypoints=pixels,
             scale=radius[order] * float(np.sqrt(zoom.prod())),
             angle=angle[order],
-            descriptors=root_sift(np.asarray(descriptors, dtype=np.uint8)),
+            descriptors=root_sift(np.asarray(described, dtype=np.uint8)[order]),
             colors=at_pixels(image, pixels),
         )
 
 
-def reduce_to(image: UInt8[np.ndarray, "h w 3"], max_size: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The image with its longer side at most `max_size` pixels; never enlarged."""
-    height, width = image.shape[:2]
+def reduced_grey(image: UInt8[np.ndarray, "h w 3"], max_size: int) -> UInt8[np.ndarray, "_ _"]:
+    """Grey levels of an sRGB image with its longer side at most `max_size` pixels; never enlarged."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height, width = grey.shape
     factor = max_size / max(height, width)
-    if factor >= 1.0:
-        return image
-    size = max(round(width * factor), 1), max(round(height * factor), 1)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if factor < 1.0:
+        size = max(round(width * factor), 1), max(round(height * factor), 1)
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey, dtype=np.uint8)
 
 
 def spread(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.features.sift import Sift, reduce_to
+from fieldstone.features.sift import Sift, reduced_grey
 from fieldstone.io.masks import check_polarity, find_masks, read_mask
 from fieldstone.io.names import name_problem
 from fieldstone.io.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
@@ -72,9 +72,10 @@ def detect(
         except InputError as error:
             return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
         keep = None if mask is None else read_mask(mask, photo.info)
-        features = extractor(photo.rgb, keep)
+        grey = reduced_grey(photo.rgb, options.sift.max_image_size)
+        features = extractor.of_grey(grey, photo.rgb, keep)
         kept = 1.0 if keep is None else float(keep.mean())
-        facts = {"kept": kept, "sharpness": sharpness(photo.rgb, options.sift.max_image_size)}
+        facts = {"kept": kept, "sharpness": sharpness(grey)}
         arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
         workspace.keep(STAGE, key, Unit(arrays, facts))
         return SeenPhoto(photo.info, features, key, mask=mask, **facts)
@@ -106,12 +107,11 @@ def one_thread_each() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def sharpness(rgb: UInt8[np.ndarray, "h w 3"], max_image_size: int) -> float:
-    """How strong the finest detail of a photo is, relative to its contrast: 0 for none.
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """How strong the finest detail of grey levels is, relative to its contrast: 0 for none.
 
     The root mean square of the Laplacian over the standard deviation of the grey levels. It compares photos of one
     scene; there is no value that is sharp for all.
     """
-    grey = cv2.cvtColor(reduce_to(rgb, max_image_size), cv2.COLOR_RGB2GRAY)
     contrast = float(grey.std())
     return float(cv2.Laplacian(grey, cv2.CV_32F).std()) / contrast if contrast > 0.0 else 0.0
