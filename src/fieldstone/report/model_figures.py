@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
@@ -235,7 +234,7 @@ def frustum_size(model: Reconstruction) -> float:
     reach = 0.16 * float(np.median(distances)) if len(distances) else 1.0
     if len(centers) < 2:
         return reach
-    to_nearest = KDTree(centers).query(centers, k=2)[0][:, 1]
+    to_nearest = [np.partition(np.linalg.norm(centers - c, axis=1), 1)[1] for c in centers[evenly(len(centers), 1000)]]
     return float(np.clip(0.8 * np.median(to_nearest), 0.2 * reach, reach))
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from fieldstone.geometry.rotation import exp, right_jacobian
@@ -54,6 +53,8 @@ def bundle_adjust_scipy(
     Source:
         `triggs2000`; `hartley2004`, appendix 6.
     """
+    from scipy.optimize import least_squares  # see `nonlinear`
+
     loss = loss or trivial()
     columns = _assign_columns(problem)
     if columns.count == 0 or len(problem.view) == 0:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import least_squares
 
 from fieldstone.geometry.camera import Camera, image_from_cam, image_from_cam_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
@@ -79,6 +78,8 @@ def pnp_nonlinear(
     Source:
         `hartley2004`, section 7.2.
     """
+    from scipy.optimize import least_squares  # a quarter of a second that photos with the default mapper do not need
+
     loss = loss or trivial()
     usable = cam_from_world.apply(points_in_world)[:, 2] > 0
     if usable.sum() < 3:
