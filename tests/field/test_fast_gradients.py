@@ -19,7 +19,16 @@ ROOM = 4096
 
 
 def forward_and_backward(
-    field, origins, directions, target, background, sparsity=0.0, gain=None, points=None, point_weight=0.0
+    field,
+    origins,
+    directions,
+    target,
+    background,
+    sparsity=0.0,
+    gain=None,
+    points=None,
+    point_weight=0.0,
+    emptiness=0.0,
 ) -> tuple[float, Decoder, np.ndarray, Samples, int, np.ndarray]:
     """Squared colour errors, the gradient of the loss by group, the samples of all rays, and the gradient of gains.
 
@@ -55,7 +64,7 @@ def forward_and_backward(
     point_terms(samples, count, first, rows, on_rays, march.step, np.float32(point_weight), d_weight)
     loss = composite_backward(
         samples, count, first, passed, target.reshape(-1), background.reshape(-1), gain.reshape(-1), rgb, d_weight,
-        np.float32(2), np.float32(sparsity), d_color, d_raw, d_gain,
+        np.float32(2), np.float32(sparsity), np.float32(emptiness), d_color, d_raw, d_gain,
     )  # fmt: skip
     gradient = Decoder(*(np.zeros_like(weights) for weights in field.decoder))
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
@@ -104,17 +113,21 @@ def point_loss(points, samples, n, step, weight) -> np.ndarray:
     return np.where(row < 0, 0.0, weight * (before.astype(float) - there))
 
 
-@pytest.mark.parametrize(("sparsity", "point_weight"), [(0.0, 0.0), (0.7, 0.0), (0.0, 0.4)])
-def test_gradients_match_autograd(case, sparsity, point_weight):
+@pytest.mark.parametrize(
+    ("sparsity", "point_weight", "emptiness"), [(0.0, 0.0, 0.0), (0.7, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.3)]
+)
+def test_gradients_match_autograd(case, sparsity, point_weight, emptiness):
     torch = pytest.importorskip("torch")
-    from fieldstone.field.torch_field import packed_colors, packed_weights, torch_fast_field
+    from fieldstone.field.torch_field import optical_depths, packed_colors, packed_weights, torch_fast_field
 
     field, _, directions, target, background = case
+    bare = torch.arange(60) % 3 == 0
     rng = np.random.default_rng(4)
     gain = rng.uniform(0.7, 1.4, (60, 3)).astype(np.float32)
+    target[::3] = background[::3]
     points = known_points(rng, directions)
     loss, gradient, table, samples, n, d_gain = forward_and_backward(
-        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight
+        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight, emptiness=emptiness
     )
     twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
     positions = torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64))
@@ -129,7 +142,9 @@ def test_gradients_match_autograd(case, sparsity, point_weight):
     squared = ((theta.exp() * colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
     opacity = torch.zeros(60, dtype=torch.float64).index_add(0, ray, weights)
     by_sample = point_loss(points, samples, n, float(field.march(0.0, 0.0).step), point_weight)
+    depths = optical_depths(twin, positions, scale)
     total = squared + sparsity * opacity.sum() + (torch.tensor(by_sample) * weights).sum()
+    total = total + emptiness * torch.log1p(depths[bare[ray]]).sum()
     parameters = [*(twin.decoder[name] for name in Decoder._fields), *twin.levels, theta]
     expected = [g.numpy() for g in torch.autograd.grad(total, parameters)]
     assert loss == pytest.approx(squared.item(), rel=1e-4)

@@ -223,13 +223,29 @@ def composite_numba(samples, num_rays, first, passed, far, background, rgb, colo
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def composite_backward(
-    samples, num_rays, first, passed, target, background, gain, rgb, d_weight, scale, sparsity, d_color, d_raw, d_gain
+    samples,
+    num_rays,
+    first,
+    passed,
+    target,
+    background,
+    gain,
+    rgb,
+    d_weight,
+    scale,
+    sparsity,
+    emptiness,
+    d_color,
+    d_raw,
+    d_gain,
 ):
     """Squared colour errors, summed up, and `scale` times half the gradient of this sum and of what else counts.
 
     A photo shows gain C: its exposure and white balance by channel. The opacity of a ray, 1 - T_end, counts
-    `sparsity` times: fog in the colour of the background costs nothing else. Whatever else counts says by d_weight
-    how it depends on the weight of each sample. With g = gain (gain C - target) and w_i = T_i alpha_i:
+    `sparsity` times: fog in the colour of the background costs nothing else. Something solid in that colour does not
+    feel it, since T_end is 0 anyhow: on rays that show the background exactly, sum log(1 + tau_i) counts `emptiness`
+    times. Whatever else counts says by d_weight how it depends on the weight of each sample. With
+    g = gain (gain C - target) and w_i = T_i alpha_i:
     dC / dtau_i = T_(i+1) c_i - sum_{j>i} w_j c_j - T_end background,  dtau / draw = tau.
     d_weight: (s) half the derivative by w_i. d_color: (s, 3) gradient before the sigmoid. d_raw: (s). gain, d_gain:
     (r, 3), the gradient by the logarithm of the gain.
@@ -257,12 +273,16 @@ def composite_backward(
         g0, g1, g2 = g0 * r * scale, g1 * g * scale, g2 * b * scale
         behind = left * (background[ray * 3] * g0 + background[ray * 3 + 1] * g1 + background[ray * 3 + 2] * g2)
         behind -= np.float32(0.5) * scale * sparsity * left
+        bare = target[ray * 3] == background[ray * 3] and target[ray * 3 + 1] == background[ray * 3 + 1]
+        bare = bare and target[ray * 3 + 2] == background[ray * 3 + 2]
+        thinner = np.float32(0.5) * scale * emptiness if bare else np.float32(0)
         for i in range(end - 1, start - 1, -1):
             light, alpha = at(samples.light, i), at(samples.alpha, i)
             weight = light * alpha
             r, g, b = at(rgb, i * 3), at(rgb, i * 3 + 1), at(rgb, i * 3 + 2)
             own = r * g0 + g * g1 + b * g2 + scale * at(d_weight, i)
-            d_raw[i] = (light * (one - alpha) * own - behind) * at(samples.tau, i)
+            tau = at(samples.tau, i)
+            d_raw[i] = (light * (one - alpha) * own - behind + thinner / (one + tau)) * tau
             behind += weight * own
             d_color[i * 3] = weight * g0 * r * (one - r)
             d_color[i * 3 + 1] = weight * g1 * g * (one - g)

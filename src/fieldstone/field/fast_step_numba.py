@@ -172,7 +172,7 @@ def chunk_step(
     point_terms(samples, num_rays, rays.first, rays.point, points, march.step, terms.points, work.d_weight)
     loss = composite_backward(
         samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb, work.d_weight,
-        GRADIENT_SCALE, terms.sparsity, work.d_color, work.d_raw, work.d_gain,
+        GRADIENT_SCALE, terms.sparsity, terms.emptiness, work.d_color, work.d_raw, work.d_gain,
     )  # fmt: skip
     chunk.gain_gradient[:] = 0
     for ray in range(num_rays):

@@ -19,6 +19,8 @@ class Terms(NamedTuple):
 
     sparsity: np.float32
     """Opacity of a ray."""
+    emptiness: np.float32
+    """Optical depth, by its logarithm, on rays that show nothing but the background."""
     points: np.float32
     """Light that does not end at the known point of its ray."""
 

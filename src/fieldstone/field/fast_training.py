@@ -109,6 +109,8 @@ class FastTraining:
     plan: FastPlan
     seed: int
     executor: Executor
+    alpha_known: bool
+    """Photos say themselves where they show the background."""
 
     def start(self) -> FastState:
         """The state before the first step."""
@@ -178,7 +180,9 @@ class FastTraining:
         field, room, plan = state.field, state.workspace, state.plan
         transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
         background = self.frame.background.astype(np.float32)
-        gains, terms = gains_of(state.exposure), Terms(np.float32(plan.sparsity), np.float32(plan.point_weight * share))
+        gains = gains_of(state.exposure)
+        emptiness = 0.0 if self.alpha_known else plan.emptiness
+        terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(plan.point_weight * share))
         num_known = self._num_known(state)
 
         def chunk(c: int) -> tuple[int, int, int, float]:
@@ -310,7 +314,8 @@ def fast_training(
     reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
     projection, bounds = projected or (no_projection(), np.array([[-reach] * 3, [reach] * 3]))
     occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2 if bounded else FREE_CELLS)
-    if use_alpha and bounded and all(image.pixels.shape[2] == 4 for image in images):
+    alpha_known = use_alpha and all(image.pixels.shape[2] == 4 for image in images)
+    if alpha_known and bounded:
         masks = [image.pixels[:, :, 3] > 0 for image in images]
         if not any(mask.any() for mask in masks):
             raise InputError("all photos are fully transparent: their alpha is 0 everywhere; train without alpha")
@@ -329,7 +334,9 @@ def fast_training(
     all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
     known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
-    return FastTraining(table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor)
+    return FastTraining(
+        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, alpha_known
+    )
 
 
 def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:

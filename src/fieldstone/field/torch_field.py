@@ -89,11 +89,16 @@ def packed_colors(
     return out + (1.0 - opacity)[:, None] * background
 
 
+def optical_depths(field: TorchFastField, points: Float[Tensor, "n 3"], depth_scale: float) -> Float[Tensor, "n"]:
+    """Optical depth of each sample; arguments as of `packed_colors`."""
+    return torch.exp(interpolate(field, points)[:, :, 0].sum(dim=1) + field.raw_offset) * depth_scale
+
+
 def packed_weights(
     field: TorchFastField, points: Float[Tensor, "n 3"], ray: Int[Tensor, "n"], num_rays: int, depth_scale: float
 ) -> Float[Tensor, "n"]:
     """Share of the light of its ray that ends in each packed sample; arguments as of `packed_colors`."""
-    tau = torch.exp(interpolate(field, points)[:, :, 0].sum(dim=1) + field.raw_offset) * depth_scale
+    tau = optical_depths(field, points, depth_scale)
     before = torch.cumsum(tau, dim=0) - tau
     # The sum before the first sample of each ray is taken off, so that every ray starts anew.
     starts = torch.searchsorted(ray, torch.arange(num_rays, device=ray.device, dtype=ray.dtype))
