@@ -142,3 +142,14 @@ def test_features_under_a_mask_leave_their_room_to_others():
     assert len(inside) > 50
     assert len(few) == 50
     assert len(Sift()(image, np.zeros_like(keep))) == 0
+
+
+def test_the_strongest_alone_are_described_as_among_all():
+    image = texture(0, 300, 200)
+    everything = Sift(SiftOptions(max_features=10**6))(image)
+    few = Sift(SiftOptions(max_features=50))(image)
+    assert len(everything) > 80
+    assert len(few) == 50
+    of = {(*k, a): d for k, a, d in zip(everything.keypoints, everything.angle, everything.descriptors, strict=True)}
+    for keypoint, angle, descriptor in zip(few.keypoints, few.angle, few.descriptors, strict=True):
+        np.testing.assert_array_equal(descriptor, of[(*keypoint, angle)])

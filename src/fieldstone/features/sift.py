@@ -64,7 +64,7 @@ class Sift:
 
     def of_grey(
         self,
-        grey: UInt8[np.ndarray, "g w2"],
+        grey: UInt8[np.ndarray, "gh gw"],
         image: UInt8[np.ndarray, "h w 3"],
         keep: Bool[np.ndarray, "h w"] | None = None,
     ) -> Features:

@@ -78,7 +78,7 @@ def pnp_nonlinear(
     Source:
         `hartley2004`, section 7.2.
     """
-    from scipy.optimize import least_squares  # a quarter of a second that photos with the default mapper do not need
+    from scipy.optimize import least_squares  # slow to import, and the default mapper does without it
 
     loss = loss or trivial()
     usable = cam_from_world.apply(points_in_world)[:, 2] > 0
