@@ -7,7 +7,7 @@ import pytest
 from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_field import compress, expand, field_from_tensors, occupancy_box
+from fieldstone.field.fast_field import compress, expand, field_from_tensors, occupancy_box, reachable_vertices
 from fieldstone.field.fast_plan import FastPlan, corrected, plan_for_budget, plan_from_json
 from fieldstone.field.fast_rays import coprime_stride, pixels_that_hit
 from fieldstone.field.fast_training import FastTraining, fast_training
@@ -130,7 +130,7 @@ def test_unreachable_vertices_are_left_out():
     with ThreadPoolExecutor(1) as executor:
         work = training(executor)
         state, _ = run(work, work.start(), 30)
-    vertices = compress(state.field, state.field.table)
+    vertices = compress(state.field, state.field.table, reachable_vertices(state.field))
     assert 0 < len(vertices) < len(state.field.table) // 4
     again = expand(state.field, vertices)
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, RADIUS, ball_images
-from fieldstone.field.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
+from fieldstone.field.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, in_bricks, visual_hull
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.05, 1.0])
@@ -17,6 +17,15 @@ def test_distances_match_brute_force(share):
     for cell in occupied:
         expected = np.minimum(expected, np.abs(index - cell).max(axis=-1))
     np.testing.assert_array_equal(cell_distances(cells), expected)
+
+
+def test_bricks_hold_every_value_at_its_place():
+    values = np.random.default_rng(0).integers(0, 256, (9, 4, 13), dtype=np.uint8)
+    flat, bricks = in_bricks(values)
+    assert bricks.tolist() == [3, 1, 4]
+    for cell, value in np.ndenumerate(values):
+        outer, (i, j, k) = np.array(cell) // 4, np.array(cell) % 4
+        assert flat[64 * np.ravel_multi_index(outer, bricks) + 16 * i + 4 * j + k] == value
 
 
 @pytest.mark.parametrize("cell_size", [0.05, 0.1, 0.07, 0.31])

@@ -7,6 +7,7 @@ from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.io.photos import write_photo
+from fieldstone.pipeline import fast_fields
 from fieldstone.pipeline.fast_fields import train_fast_run
 
 
@@ -47,6 +48,15 @@ def test_a_budget_is_kept_and_leaves_its_plan(ball_folder, tmp_path):
     assert metrics["psnr"] > 12.0
     assert (tmp_path / "out" / "renders" / "test" / "r_0.png").is_file()
     assert json.loads((tmp_path / "out" / "plan.json").read_text()) == json.loads(json.dumps(metrics["plan"]))
+
+
+def test_a_run_out_of_time_is_saved_once(ball_folder, tmp_path, monkeypatch):
+    saved = []
+    write = fast_fields.write_checkpoint
+    monkeypatch.setattr(fast_fields, "write_checkpoint", lambda *of: [saved.append(of[0]), write(*of)])
+    metrics = train_fast_run(ball_folder, tmp_path / "out", budget_s=0.01, threads=1)
+    assert metrics["plan"]["stop_after"] == metrics["steps"] < sum(metrics["plan"]["steps"])
+    assert saved == [tmp_path / "out" / "checkpoint.safetensors"]
 
 
 def test_the_same_plan_gives_the_same_bytes_however_interrupted(ball_folder, tmp_path):

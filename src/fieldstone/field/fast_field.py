@@ -25,7 +25,7 @@ from fieldstone.field.fast_march_numba import (
     composite_numba,
     march_rays,
 )  # fmt: skip
-from fieldstone.field.occupancy import Occupancy, cell_distances
+from fieldstone.field.occupancy import Occupancy, cell_distances, in_bricks
 from fieldstone.field.projection import Projection, distance_along, project_rays
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, RenderedRays
 from fieldstone.scene.rays import Rays
@@ -97,10 +97,14 @@ class FastField:
         values = interpolate(self.layout, self.table, points - self.occupancy.lower)
         return decode(self.decoder, values.reshape(len(points), -1), directions)
 
-    def to_tensors(self) -> dict[str, np.ndarray]:
-        """Everything that rendering needs, as arrays; vertices that no ray can reach are left out."""
+    def to_tensors(self, reachable: Bool[np.ndarray, "v"] | None = None) -> dict[str, np.ndarray]:
+        """Everything that rendering needs, as arrays; vertices that no ray can reach are left out.
+
+        Args:
+            reachable: `reachable_vertices` of this field, if they are known already.
+        """
         return {
-            "grid": compress(self, self.table),
+            "grid": compress(self, self.table, reachable_vertices(self) if reachable is None else reachable),
             "resolutions": np.array(self.layout.resolutions, dtype=np.int64),
             "extent": self.layout.extent,
             "cells": np.packbits(self.occupancy.cells.reshape(-1)),
@@ -120,11 +124,13 @@ def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounde
     Args:
         extent: Of the grids: the last cells may reach beyond it, samples must not.
     """
+    distance, bricks = in_bricks(cell_distances(occupancy.cells))
     return Box(
         occupancy.lower.astype(np.float32),
         extent.astype(np.float32),
-        cell_distances(occupancy.cells).reshape(-1),
+        distance,
         np.array(occupancy.cells.shape, dtype=np.int64),
+        bricks,
         np.float32(occupancy.cell_size),
         unbounded,
     )
@@ -177,9 +183,15 @@ def _vertices(layout: GridLayout, table: np.ndarray) -> list[np.ndarray]:
     return [layout.level(table, level).reshape(-1, CHANNELS) for level in range(layout.num_levels)]
 
 
-def compress(field: FastField, table: Float[np.ndarray, "t"]) -> Float[np.ndarray, "v 4"]:
+def compress(
+    field: FastField, table: Float[np.ndarray, "t"], reachable: Bool[np.ndarray, "v"]
+) -> Float[np.ndarray, "k 4"]:
     """The reachable vertices of a table laid out like the field's."""
-    return np.concatenate(_vertices(field.layout, table))[reachable_vertices(field)]
+    parts, start = [], 0
+    for level in _vertices(field.layout, table):
+        parts.append(level[reachable[start : start + len(level)]])
+        start += len(level)
+    return np.concatenate(parts)
 
 
 def expand(field: FastField, vertices: Float[np.ndarray, "v 4"]) -> FastField:

@@ -32,9 +32,14 @@ class Box(NamedTuple):
     lower: np.ndarray
     extent: np.ndarray
     distance: np.ndarray
-    """uint8, flat: cells to the nearest occupied one, by the largest coordinate difference; 0 where occupied."""
+    """uint8, flat: cells to the nearest occupied one, by the largest coordinate difference; 0 where occupied.
+
+    In bricks of 4 x 4 x 4 cells, 64 bytes each: what a ray asks for next is mostly in the same cache line.
+    """
     cells: np.ndarray
     """int64 (3)."""
+    bricks: np.ndarray
+    """int64 (3): bricks along each axis."""
     cell_size: np.float32
     unbounded: bool
 
@@ -70,6 +75,14 @@ class Samples(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
+def distance_at(box, i, j, k):
+    """`Box.distance` of cell i, j, k."""
+    brick = ((i >> 2) * at(box.bricks, 1) + (j >> 2)) * at(box.bricks, 2) + (k >> 2)
+    return np.int64(at(box.distance, (brick << 6) | ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@no_type_check
 def cut_to_slab(o, d, low, high, t0, t1):
     """Cut [t0, t1] to where o + t d lies in [low, high]."""
     if abs(d) < np.float32(1e-9):
@@ -100,7 +113,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
 
     jitter: share of a step before the first sample. far: where the ray ends at the latest.
     """
-    one, zero = np.float32(1), np.float32(0)
+    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     dx, dy, dz = at(directions, ray * 3), at(directions, ray * 3 + 1), at(directions, ray * 3 + 2)
     ex, ey, ez = at(box.extent, 0), at(box.extent, 1), at(box.extent, 2)
     ox, oy, oz = (
@@ -125,11 +138,11 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             stride = march.step
             if box.unbounded:
-                cx, cy, cz = (x - 2 * half) / half, (y - 2 * half) / half, (z - 2 * half) / half
+                cx, cy, cz = x / half - two, y / half - two, z / half - two
                 m = max(abs(cx), max(abs(cy), abs(cz)))
                 if m > one:
-                    s = (2 - one / m) / m * half
-                    x, y, z = 2 * half + cx * s, 2 * half + cy * s, 2 * half + cz * s
+                    s = (two - one / m) / m
+                    x, y, z = (two + cx * s) * half, (two + cy * s) * half, (two + cz * s) * half
                     stride = march.step * m * m
             x, y, z = min(max(x, zero), ex), min(max(y, zero), ey), min(max(z, zero), ez)
             i, j, k = (
@@ -137,7 +150,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
                 min(np.int64(y * per_cell), ny - 1),
                 min(np.int64(z * per_cell), nz - 1),
             )
-            distance = np.int64(at(box.distance, (i * ny + j) * nz + k))
+            distance = distance_at(box, i, j, k)
             if distance > 0:
                 if box.unbounded:
                     t += stride
@@ -151,6 +164,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
             prefetch_point(grid, x, y, z, finest)
             if finest > 2:
                 prefetch_point(grid, x, y, z, finest - 1)
+                prefetch_point(grid, x, y, z, finest - 2)
         if head == tail or n >= capacity:
             break
         q = (head & (QUEUE - 1)) * 4

@@ -11,6 +11,10 @@ from fieldstone.field.fast_decoder import Decoder
 from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
 from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
 from fieldstone.field.fast_terms_numba import point_terms
+from fieldstone.field.simd_numba import prefetch
+
+AHEAD = 16
+"""Rays between asking for a row of the table and using it."""
 
 GRADIENT_SCALE = np.float32(1e-2)
 """Constant factor on all gradients; RMSprop and Adam do not depend on it."""
@@ -97,6 +101,14 @@ def project_ray_numba(projection, origins, directions, ray):
     directions[ray * 3], directions[ray * 3 + 1], directions[ray * 3 + 2] = dx / length, dy / length, dz / length
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@no_type_check
+def drawn_row(table, number):
+    """The row of the table that is drawn as number `number`."""
+    rows = np.uint64(table.image.shape[0])
+    return np.int64(np.uint64(number) % rows * np.uint64(table.stride) % rows)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def draw_rays(table, projection, gains, start, count, seed, background, rays, at):
@@ -104,11 +116,15 @@ def draw_rays(table, projection, gains, start, count, seed, background, rays, at
 
     They are put to place `at` and after. gains: (v, 3) flat, of each photo.
     """
-    rows = np.uint64(table.image.shape[0])
     scale = np.float32(1.0 / 255.0)
     for k in range(count):
         n = at + k
-        row = np.int64((np.uint64(start + k) % rows) * np.uint64(table.stride) % rows)
+        ahead = drawn_row(table, start + k + AHEAD)
+        prefetch(table.image, ahead)
+        prefetch(table.bearing, ahead)
+        prefetch(table.rgba, ahead * 4)
+        prefetch(table.bearings, np.int64(table.bearing[drawn_row(table, start + k + AHEAD // 2)]) * 3)
+        row = drawn_row(table, start + k)
         v, b = table.image[row], table.bearing[row]
         x, y, z = table.bearings[b, 0], table.bearings[b, 1], table.bearings[b, 2]
         alpha = np.float32(table.rgba[row, 3]) * scale

@@ -26,6 +26,7 @@ from fieldstone.field.fast_field import (
     expand,
     field_from_tensors,
     occupancy_box,
+    reachable_vertices,
     renderer,
 )  # fmt: skip
 from fieldstone.field.fast_grid import CHANNELS, grid_layout
@@ -51,6 +52,9 @@ CELL_VERTICES = 2
 
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
+
+LAST_PRUNED = 4
+"""Stages after this one give up cells when they begin, and not again: there is hardly anything left to give up."""
 
 START_WEIGHTS = 1.2
 """The fog of the start weighs at least this many times `FastPlan.min_weight` in every sample."""
@@ -201,7 +205,8 @@ class FastTraining:
         stage = plan.stage_of(state.step)
         into_stage = state.step - sum(plan.steps[:stage])
         prune = into_stage == 0 and stage > 0
-        prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
+        if stage <= LAST_PRUNED:
+            prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
         if prune and state.step >= MIN_STEPS:
             fog = FOG * math.exp(state.field.raw_offset) if stage >= plan.clear_fog_from else 0.0
             field = self._pruned(state.field, max(plan.prune_density, fog))
@@ -244,11 +249,12 @@ class FastTraining:
     def to_tensors(self, state: FastState, /) -> dict[str, np.ndarray]:
         """The field, and what resuming needs besides."""
         plan = state.plan
-        tensors = state.field.to_tensors() | {
+        reachable = reachable_vertices(state.field)
+        tensors = state.field.to_tensors(reachable) | {
             "step": np.array(state.step, dtype=np.int64),
             "cursor": np.array(state.cursor, dtype=np.int64),
             "chunk_rays": state.chunk_rays,
-            "velocity": compress(state.field, state.velocity),
+            "velocity": compress(state.field, state.velocity, reachable),
             "plan": np.frombuffer(plan.to_json().encode(), dtype=np.uint8).copy(),
         }
         for name in Decoder._fields:

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from fieldstone.field.occupancy_numba import carve_numba, chebyshev_numba
+from fieldstone.field.occupancy_numba import carve_numba
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 
 MAX_DISTANCE = 16
 """Empty cells know their distance to the next occupied one up to this many cells."""
+
+BRICK = 4
+"""Cells along the side of a brick."""
 
 MASK_SIDE = 256
 """Masks are reduced to this many blocks along their longer side before carving."""
@@ -66,6 +69,8 @@ class Occupancy:
         """
         extent = self.extent if extent is None else extent
         shape = np.maximum(np.ceil(extent / cell_size - 1e-4).astype(np.int64), 1)
+        if cell_size == self.cell_size and tuple(shape.tolist()) == self.cells.shape:
+            return self
         parts = []
         for axis in range(3):
             low = np.floor(np.arange(shape[axis]) * cell_size / self.cell_size + 1e-6).astype(np.int64)
@@ -94,9 +99,31 @@ def cell_distances(cells: Bool[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "x y z
 
     All cells within a distance of less than d of a cell with value d are empty.
     """
-    distance = np.where(cells, 0, MAX_DISTANCE).astype(np.uint8)
-    chebyshev_numba(distance.reshape(-1), *cells.shape)
+    distance = np.zeros(cells.shape, dtype=np.uint8)
+    reached = cells
+    for _ in range(MAX_DISTANCE):
+        distance += ~reached
+        reached = _grown_by_one(reached)
     return distance
+
+
+def _grown_by_one(cells: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """The cells and all that touch them, by a corner at least."""
+    for axis in range(3):
+        along = np.moveaxis(cells, axis, 0)
+        grown = along.copy(order="K")
+        grown[1:] |= along[:-1]
+        grown[:-1] |= along[1:]
+        cells = np.moveaxis(grown, 0, axis)
+    return cells
+
+
+def in_bricks(values: UInt8[np.ndarray, "x y z"]) -> tuple[UInt8[np.ndarray, "n"], Int[np.ndarray, "3"]]:
+    """Values of cells brick by brick, see `fast_march_numba.Box`, and the number of bricks along each axis."""
+    bricks = -(-np.array(values.shape) // BRICK)
+    padded = np.pad(values, [(0, BRICK * n - size) for n, size in zip(bricks.tolist(), values.shape, strict=True)])
+    split = padded.reshape(bricks[0], BRICK, bricks[1], BRICK, bricks[2], BRICK)
+    return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1), bricks
 
 
 def visual_hull(

@@ -8,40 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldstone.field.fast_grid_numba import interpolate_point_numba
-from fieldstone.field.fast_march_numba import cut_to_slab, steps_out_of_cell
-from fieldstone.field.simd_numba import at
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _chebyshev_line(values, start, stride, count, line):
-    """values[i] <- min over j of max(|i - j|, values[j]) along one line of a flat array."""
-    for i in range(count):
-        line[i] = values[start + i * stride]
-    for i in range(count):
-        best = line[i]
-        d = 1
-        while d < best:
-            if i >= d:
-                best = min(best, max(line[i - d], d))
-            if i + d < count:
-                best = min(best, max(line[i + d], d))
-            d += 1
-        values[start + i * stride] = best
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def chebyshev_numba(distance, nx, ny, nz):  # flat (x, y, z) uint8: 0, or the largest distance -> distances, in place
-    """The largest-coordinate distance is separable: the best along z, then along y of these, then along x."""
-    line = np.empty(max(nx, max(ny, nz)), np.int64)
-    for n in range(nx * ny):
-        _chebyshev_line(distance, n * nz, 1, nz, line)
-    for i in range(nx):
-        for k in range(nz):
-            _chebyshev_line(distance, i * ny * nz + k, nz, ny, line)
-    for n in range(ny * nz):
-        _chebyshev_line(distance, n, ny * nz, nx, line)
+from fieldstone.field.fast_march_numba import cut_to_slab, distance_at, steps_out_of_cell
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -106,7 +73,7 @@ def rays_that_hit(box, origin, directions, out):  # (3,), (r, 3) -> (r,) uint8
             z = min(max(oz + t * dz, zero), ez)
             i, j = min(np.int64(x * per_cell), nx - 1), min(np.int64(y * per_cell), ny - 1)
             k = min(np.int64(z * per_cell), nz - 1)
-            distance = np.int64(at(box.distance, (i * ny + j) * nz + k))
+            distance = distance_at(box, i, j, k)
             if distance == 0:
                 out[ray] = 1
                 break

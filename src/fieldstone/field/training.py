@@ -113,14 +113,18 @@ def train(
     on_step: OnStep = lambda point: None,
     save: Callable[[S, tuple[CurvePoint, ...]], None] = lambda state, curve: None,
     save_every_s: float = 60.0,
+    save_at_end: bool = True,
 ) -> tuple[S, tuple[CurvePoint, ...]]:
     """Step until the budget or the number of steps is used up; `save` is called now and then, and at the end.
+
+    An interruption saves too.
 
     Args:
         state: Where to start; after a stop, what the checkpoint holds.
         budget_s: Seconds of training in all, those of `curve` included; None: no limit.
         max_steps: Steps in all, those of `curve` included; None: no limit.
         curve: The steps done before.
+        save_at_end: False leaves the last state to the caller, who goes on with it.
 
     Returns:
         The last state, and the curve of all steps.
@@ -150,7 +154,8 @@ def train(
         logger.warning("interrupted after %d steps; they are kept", len(points))
         save(state, tuple(points))
         raise
-    save(state, tuple(points))
+    if save_at_end:
+        save(state, tuple(points))
     return state, tuple(points)
 
 

@@ -82,13 +82,18 @@ class Photo:
     """A decoded photo, upright, sRGB. alpha is straight (colours are not multiplied by it), None if opaque."""
 
     info: PhotoInfo
-    rgb: UInt8[np.ndarray, "h w 3"]
-    alpha: UInt8[np.ndarray, "h w"] | None
+    pixels: UInt8[np.ndarray, "h w c"]
+    """RGB, or RGBA where there is alpha."""
 
     @property
-    def pixels(self) -> UInt8[np.ndarray, "h w c"]:
-        """RGB, or RGBA where there is alpha."""
-        return self.rgb if self.alpha is None else np.dstack([self.rgb, self.alpha])
+    def rgb(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Colours alone."""
+        return np.ascontiguousarray(self.pixels[:, :, :3])
+
+    @property
+    def alpha(self) -> UInt8[np.ndarray, "h w"] | None:
+        """Opacity alone."""
+        return np.ascontiguousarray(self.pixels[:, :, 3]) if self.pixels.shape[2] == 4 else None
 
 
 @dataclass(frozen=True)
@@ -163,8 +168,7 @@ def read_photo(path: Path, *, at_least_px: int | None = None, max_megapixels: fl
             pixels = np.asarray(image)
         except DAMAGE as error:
             raise InputError(f"{path}: damaged or truncated photo ({_reason(error)}); copy it again") from error
-    alpha = pixels[:, :, 3].copy() if pixels.shape[2] == 4 else None
-    return Photo(info, np.ascontiguousarray(pixels[:, :, :3]), alpha)
+    return Photo(info, pixels)
 
 
 def read_photos(

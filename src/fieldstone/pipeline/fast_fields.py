@@ -202,12 +202,8 @@ def train_stages(
         before, began = state.step, time.perf_counter()
         left = None if deadline is None else deadline - began + (curve[-1].seconds if curve else 0.0)
 
-        def save_unless_going_on(state: FastState, curve: tuple[CurvePoint, ...], last: int = last) -> None:
-            if state.step != last:
-                save(state, curve)
-
         state, curve = train(
-            training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=save_unless_going_on
+            training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=save, save_at_end=False
         )
         preview(state)
         now = time.perf_counter()

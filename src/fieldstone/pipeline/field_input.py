@@ -33,7 +33,7 @@ from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender
 from fieldstone.io.colmap import find_colmap_model, read_colmap
 from fieldstone.io.llff import is_llff_folder, read_llff
 from fieldstone.io.masks import find_masks, read_mask
-from fieldstone.io.photos import Photo, read_photo
+from fieldstone.io.photos import read_photo
 from fieldstone.io.posed_photos import PosedPhoto, PosedScene
 from fieldstone.io.transforms_json import find_transforms, read_transforms
 from fieldstone.render.camera_paths import focus_point
@@ -172,18 +172,22 @@ def read_images(
     Raises:
         InputError: A photo is too small, or does not have the size of its camera or its mask.
     """
+
+    def decoded(photo: PosedPhoto) -> tuple[np.ndarray, np.ndarray | None]:
+        found = read_photo(photo.path)
+        return found.pixels, None if photo.mask is None else read_mask(photo.mask, found.info)
+
     images = []
     with ThreadPoolExecutor() as pool:
         # Decoding leaves Python's lock; results are taken in order.
-        reading = [pool.submit(read_photo, photo.path) for photo in photos]
-        for photo, found in zip(photos, reading, strict=True):
+        reading = [pool.submit(decoded, photo) for photo in photos]
+        for photo, result in zip(photos, reading, strict=True):
             try:
-                decoded = found.result()
-                keep = None if photo.mask is None else read_mask(photo.mask, decoded.info)
+                pixels, keep = result.result()
             except InputError as error:
                 logger.warning("skipped %s", error)
                 continue
-            images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels_of(decoded), keep))
+            images.append(PosedImage(photo.name, photo.camera, photo.cam_from_world, pixels, keep))
     if without_borders:
         images = _masked_borders(images)
     reduced = reduce_images(tuple(images), image_size_px)
@@ -303,8 +307,3 @@ def _recorded(source: Path, name: str) -> Path | None:
     except (OSError, ValueError, KeyError, TypeError):
         logger.debug("%s: no run.json that names %s", source, name)
         return None
-
-
-def pixels_of(photo: Photo) -> np.ndarray:
-    """RGB or, where the photo has transparency, RGBA pixels."""
-    return photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
