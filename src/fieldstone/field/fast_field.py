@@ -70,9 +70,14 @@ class FastField:
         """How rays are sampled, with the thresholds of the caller."""
         step = float(self.layout.spacings[-1]) * self.step_cells
         return March(
-            np.float32(step), np.float32(self.raw_offset), np.float32(step / self.reference_length),
+            np.float32(step), np.float32(self.raw_offset), np.float32(self.step_depth),
             np.float32(min_weight), np.float32(min_light), np.float32(self.near),
         )  # fmt: skip
+
+    @property
+    def step_depth(self) -> float:
+        """Optical depth of one step at density 1."""
+        return float(self.layout.spacings[-1]) * self.step_cells / self.reference_length
 
     @property
     def reference_length(self) -> float:

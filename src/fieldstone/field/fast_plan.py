@@ -67,6 +67,8 @@ class FastPlan:
     """Weight of the opacity of a ray against its squared colour error."""
     emptiness: float = 2e-3
     """Weight of what stands on rays that show exactly the background, where photos of an object have no alpha."""
+    clear_floaters_from: int = len(STAGE_SHARES)
+    """From this stage on, solid pieces that are tied to nothing are given up, where points are known."""
     exposure_rate: float = 0.0
     """Step of the logarithm of a photo's exposure, at the start of training; 0: all photos are alike."""
     point_weight: float = 0.0
@@ -160,7 +162,7 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
         return FastPlan(finest, steps, samples_per_chunk=room)
     return FastPlan(
         finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
-        clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5,
+        clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5, clear_floaters_from=3,
     )  # fmt: skip
 
 

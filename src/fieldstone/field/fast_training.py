@@ -13,7 +13,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.field.fast_decoder import HIDDEN, Decoder, decoder_width, initial_decoder
@@ -36,6 +36,7 @@ from fieldstone.field.fast_step_numba import chunk_step
 from fieldstone.field.fast_terms_numba import PointRays, Terms
 from fieldstone.field.fast_update import move_grid, step_decoder
 from fieldstone.field.fast_workspace import RAYS_PER_KNOWN, Workspace, workspace
+from fieldstone.field.floaters import places_in_box, without_floaters
 from fieldstone.field.free_space import carve_free_space
 from fieldstone.field.known_points import known_rays, no_known_rays
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
@@ -52,6 +53,9 @@ CELL_VERTICES = 2
 
 PRUNE_AT = (0.25, 0.6)
 """Shares of a stage after which empty cells are given up; also when a stage begins."""
+
+SOLID = 0.1
+"""A cell is solid where a step takes this optical depth."""
 
 LAST_PRUNED = 4
 """Stages after this one give up cells when they begin, and not again: there is hardly anything left to give up."""
@@ -113,6 +117,8 @@ class FastTraining:
     plan: FastPlan
     seed: int
     executor: Executor
+    places: Float[np.ndarray, "p 3"]
+    """Known points, in the space of the grids."""
     alpha_known: bool
     """Photos say themselves where they show the background."""
 
@@ -210,6 +216,8 @@ class FastTraining:
         if prune and state.step >= MIN_STEPS:
             fog = FOG * math.exp(state.field.raw_offset) if stage >= plan.clear_fog_from else 0.0
             field = self._pruned(state.field, max(plan.prune_density, fog))
+            if plan.clear_floaters_from <= stage and into_stage == 0 and len(self.places):
+                field = self._without_floaters(field)
             state = replace(state, field=field, workspace=replace(state.workspace, box=field.box()))
         if plan.scout and stage == 1 and into_stage == 0:
             found = self._first_state(plan, state.field.occupancy.trimmed(), stage=1)
@@ -220,31 +228,38 @@ class FastTraining:
         return state
 
     def _pruned(self, field: FastField, density: float) -> FastField:
+        """The field without the cells that are nowhere denser than `density`."""
         spacing = float(field.layout.spacings[-1])
         cell_size = min(spacing * CELL_VERTICES, field.occupancy.cell_size)
         occupancy = field.occupancy.resampled(cell_size, field.layout.extent)
-        cells = occupancy.cells.copy()
+        cells = self._denser(field, occupancy, density)
+        if not cells.any():
+            return field
+        logger.debug("occupied cells: %.2f %% of %s", 100.0 * cells.mean(), cells.shape)
+        return replace(field, occupancy=replace(occupancy, cells=cells))
+
+    def _without_floaters(self, field: FastField) -> FastField:
+        solid = self._denser(field, field.occupancy, SOLID / field.step_depth)
+        occupancy = without_floaters(field.occupancy, solid, self.places, unbounded=self.unbounded)
+        cleared = np.count_nonzero(field.occupancy.cells) - np.count_nonzero(occupancy.cells)
+        logger.debug("cleared %d cells around what hangs in the air", cleared)
+        return replace(field, occupancy=occupancy)
+
+    def _denser(self, field: FastField, occupancy: Occupancy, density: float) -> Bool[np.ndarray, "x y z"]:
+        """Which occupied cells are denser than `density` somewhere."""
+        spacing, cells = float(field.layout.spacings[-1]), occupancy.cells.copy()
         grid = field.layout.arrays(field.table)
         threshold = np.float32(math.log(density))
         pieces = np.linspace(0, len(cells), 17).astype(np.int64)
 
         def piece(n: int) -> None:
             used_cells(
-                grid,
-                cells,
-                occupancy.cell_size,
-                spacing,
-                np.float32(field.raw_offset),
-                threshold,
-                pieces[n],
+                grid, cells, occupancy.cell_size, spacing, np.float32(field.raw_offset), threshold, pieces[n],
                 pieces[n + 1],
-            )
+            )  # fmt: skip
 
         list(self.executor.map(piece, range(16)))
-        if not cells.any():
-            return field
-        logger.debug("occupied cells: %.2f %% of %s", 100.0 * cells.mean(), cells.shape)
-        return replace(field, occupancy=Occupancy(occupancy.lower, occupancy.cell_size, cells))
+        return cells
 
     def to_tensors(self, state: FastState, /) -> dict[str, np.ndarray]:
         """The field, and what resuming needs besides."""
@@ -340,8 +355,9 @@ def fast_training(
     all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
     known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
+    places = places_in_box(frame.normalized_from_world.apply(points), projection, unbounded=unbounded)
     return FastTraining(
-        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, alpha_known
+        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, places, alpha_known
     )
 
 

@@ -103,11 +103,11 @@ def cell_distances(cells: Bool[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "x y z
     reached = cells
     for _ in range(MAX_DISTANCE):
         distance += ~reached
-        reached = _grown_by_one(reached)
+        reached = grown_by_one(reached)
     return distance
 
 
-def _grown_by_one(cells: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+def grown_by_one(cells: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """The cells and all that touch them, by a corner at least."""
     for axis in range(3):
         along = np.moveaxis(cells, axis, 0)
