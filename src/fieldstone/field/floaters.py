@@ -62,8 +62,9 @@ def without_floaters(
         inner = np.zeros_like(ties)
         inner[tuple(slice(n // 4, n - n // 4) for n in solid.shape)] = True
         ties |= ~inner
-    pieces, count = label(solid, CORNERS_TOO)
-    tied = np.zeros(count + 1, dtype=bool)
+    pieces = np.empty(solid.shape, dtype=np.int32)
+    label(solid, CORNERS_TOO, output=pieces)
+    tied = np.zeros(int(pieces.max()) + 1, dtype=bool)
     tied[pieces[ties]] = True
     tied[0] = False
     kept = tied[pieces]
