@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME
+from fieldstone.field.floaters import places_in_box
 from fieldstone.field.free_space import carve_free_space, corners_in_world
 from fieldstone.field.occupancy import full_box
 from fieldstone.field.projection import no_projection, project_points, projection_for
@@ -43,25 +44,38 @@ def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
     near, far = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
     # Cells that hold a point of the wall are kept.
     for points in seen.values():
-        for x in points.xyz[:50]:
-            x = 0.999 * x  # beside the plane that cells share, in the cells before it
-            holds = ((near <= x) & (x <= far)).all(axis=-1)
-            assert carved.cells[holds].all()
-    # A cell in front of all cameras, well before the wall, is free; one behind them is not.
+        before_plane = 0.999 * points.xyz  # the wall itself is a plane that cells share
+        places = places_in_box(FRAME.normalized_from_world.apply(before_plane), no_projection(), unbounded=True)
+        assert carved.cells[tuple(((places - start.lower) / start.cell_size).astype(int).T)].all()
+    # A cell in front of all cameras, well before the wall, is free, and so is one behind them; one beyond it is not.
     with np.errstate(invalid="ignore"):
         middle = np.nan_to_num(0.5 * (near + far), nan=1e9)
     before = np.argmin(np.linalg.norm(middle - [0.0, 0.0, 1.5], axis=-1))
     behind = np.argmin(np.linalg.norm(middle - [0.0, 0.0, -1.0], axis=-1))
-    assert not carved.cells.reshape(-1)[before]
-    assert carved.cells.reshape(-1)[behind]
+    beyond = np.argmin(np.linalg.norm(middle - [0.0, 0.0, 2 * WALL], axis=-1))
+    assert not carved.cells.reshape(-1)[[before, behind]].any()
+    assert carved.cells.reshape(-1)[beyond]
 
 
-def test_photos_without_points_carve_nothing():
+@pytest.mark.parametrize("points", [0, 1])
+def test_photos_without_points_carve_what_none_of_them_sees(points):
     images, _ = wall_scene(2)
     start = box(True)
-    few = {"0": SeenPoints(np.array([[0.0, 0, WALL]]), np.array([0.01]))}
+    few = {"0": SeenPoints(np.full((points, 3), WALL), np.full(points, 0.01))}
     carved = carve_free_space(start, images, FRAME, few, no_projection(), WORKER, unbounded=True)
-    np.testing.assert_array_equal(carved.cells, start.cells)
+    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    low, high = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
+    some_place = low + np.random.default_rng(0).uniform(size=(200, 1, 1, 1, 1)) * (high - low)  # along a diagonal
+    for image in images:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x, y, z = np.moveaxis(some_place + image.cam_from_world.t, -1, 0)
+            u, v = (CAMERA.focal[0] * a / z + c for a, c in zip((x, y), CAMERA.principal_point, strict=True))
+            shown = (z > 0) & (u >= 0) & (v >= 0) & (u <= CAMERA.width) & (v <= CAMERA.height)
+        assert carved.cells[shown.any(axis=0)].all()
+    with np.errstate(invalid="ignore"):
+        assert not carved.cells[high[..., 2] < 0].any()
+        assert not carved.cells[(low[..., 2] > 0.5) & (low[..., 0] > 2 * high[..., 2])].any()
+    assert 0.02 < carved.cells.mean() < 0.2
 
 
 def test_what_too_few_photos_see_from_near_is_not_there():

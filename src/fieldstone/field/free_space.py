@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
 from fieldstone.field.occupancy import Occupancy
@@ -54,10 +54,11 @@ def carve_free_space(
 
     A cell is empty if all its corners lie in front of the known points around them in one photo, or if it is nearer
     to a photo than most of its points are and too few photos see it: nothing but this photo would say what is there,
-    and anything it shows could be put there.
+    and anything it shows could be put there. Cells that no photo sees are empty too: no photo would ever correct what
+    the coarse grids spread into them, and a new view may look through them.
 
     Args:
-        seen: By name of the photo, in the world.
+        seen: By name of the photo, in the world; may be empty.
         unbounded: What is beyond the box is contracted.
     """
     corners = corners_in_world(occupancy, frame, projection, unbounded=unbounded)
@@ -75,9 +76,14 @@ def carve_free_space(
             distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
             free[inside] = away[inside] < FREE_SHARE * least_distance(image, points.xyz, distances, pixels[inside])
             near = inside & (away < np.percentile(distances, NEAR_PERCENT))
-        flags = ((free, np.logical_and), (inside, np.logical_or), (near, np.logical_or))
-        free, visible, near = (_at_corners(flag.reshape(shape), combine) for flag, combine in flags)
-        return free, visible, near
+        # A photo may see a part of a cell, but none of its corners.
+        spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
+        (left, right), (top, bottom) = spans
+        visible = (right >= 0) & (left <= image.camera.width) & (bottom >= 0) & (top <= image.camera.height)
+        return of_corners(free, np.logical_and), visible, of_corners(near, np.logical_or)
+
+    def of_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+        return _of_corners(values.reshape(shape), combine)
 
     cells = occupancy.cells.copy()
     times_seen, near_some = np.zeros(cells.shape, dtype=np.int32), np.zeros(cells.shape, dtype=bool)
@@ -86,6 +92,7 @@ def carve_free_space(
         times_seen += visible
         near_some |= near
     cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(images) >= MANY_PHOTOS else 2)))
+    cells &= times_seen > 0
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
 
 
@@ -127,9 +134,9 @@ def corners_in_world(
     return frame.normalized_from_world.inverse().apply(points).reshape(*shape, 3)
 
 
-def _at_corners(flags: Bool[np.ndarray, "x1 y1 z1"], combine: np.ufunc) -> Bool[np.ndarray, "x y z"]:
-    """Flags of the eight corners of each cell, combined."""
+def _of_corners(values: Shaped[np.ndarray, "x1 y1 z1"], combine: np.ufunc) -> Shaped[np.ndarray, "x y z"]:
+    """Values at the eight corners of each cell, combined."""
     for axis in range(3):
-        low, high = (np.take(flags, range(first, flags.shape[axis] - 1 + first), axis) for first in (0, 1))
-        flags = combine(low, high)
-    return flags
+        low, high = (np.take(values, range(first, values.shape[axis] - 1 + first), axis) for first in (0, 1))
+        values = combine(low, high)
+    return values
