@@ -349,8 +349,8 @@ def fast_training(
                 "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
                 "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
             )
-    if not bounded:
-        occupancy = carve_free_space(occupancy, images, frame, seen or {}, projection, executor, unbounded=unbounded)
+    if seen:
+        occupancy = carve_free_space(occupancy, images, frame, seen, projection, executor, unbounded=unbounded)
         logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
     all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)

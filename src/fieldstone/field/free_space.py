@@ -18,7 +18,7 @@ from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.geometry.camera import image_from_cam
 
-FREE_SHARE = 0.7
+FREE_SHARE = 0.8
 """Space is empty up to this share of the distance of known points: what has none may stand before them."""
 
 NEIGHBOURS = 8
@@ -35,6 +35,9 @@ MIN_PHOTOS, MANY_PHOTOS = 3, 8
 
 NEAR_PERCENT = 90.0
 """Percentile of the distances of its points up to which a place is near to a photo."""
+
+AROUND_PERCENT = 5.0
+"""Up to `FREE_SHARE` of this percentile of the distances of its points, a place is around a photo."""
 
 MIN_SEEN = 20
 """Fewer points of a photo say nothing of its space."""
@@ -54,8 +57,8 @@ def carve_free_space(
 
     A cell is empty if all its corners lie in front of the known points around them in one photo, or if it is nearer
     to a photo than most of its points are and too few photos see it: nothing but this photo would say what is there,
-    and anything it shows could be put there. Cells that no photo sees are empty too: no photo would ever correct what
-    the coarse grids spread into them, and a new view may look through them.
+    and anything it shows could be put there. Around a camera, that holds for the cells that no photo sees as well: no
+    photo would ever correct what the coarse grids spread into them, and a new view may look through them.
 
     Args:
         seen: By name of the photo, in the world; may be empty.
@@ -64,35 +67,40 @@ def carve_free_space(
     corners = corners_in_world(occupancy, frame, projection, unbounded=unbounded)
     places, shape = corners.reshape(-1, 3), corners.shape[:3]
 
-    def of_photo(image: PosedImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cells that are free, that the photo sees, and that it sees from near."""
+    def of_photo(image: PosedImage) -> tuple[np.ndarray, ...]:
+        """Cells that are free, that the photo sees, that it sees from near, that it sees a part of, and around it."""
         away = np.linalg.norm(places - image.cam_from_world.target_origin_in_source(), axis=1)
         pixels = image_from_cam(image.camera, image.cam_from_world.apply(places))
         # nan, behind the camera, is not inside.
         inside = np.all((pixels >= 0) & (pixels <= [image.camera.width, image.camera.height]), axis=1)
-        free, near = np.zeros((2, len(places)), dtype=bool)
+        free, near, around = np.zeros((3, len(places)), dtype=bool)
         points = seen.get(image.name)
         if points is not None and len(points.xyz) >= MIN_SEEN:
             distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
             free[inside] = away[inside] < FREE_SHARE * least_distance(image, points.xyz, distances, pixels[inside])
             near = inside & (away < np.percentile(distances, NEAR_PERCENT))
+            around = away < FREE_SHARE * np.percentile(distances, AROUND_PERCENT)
         # A photo may see a part of a cell, but none of its corners.
         spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
         (left, right), (top, bottom) = spans
-        visible = (right >= 0) & (left <= image.camera.width) & (bottom >= 0) & (top <= image.camera.height)
-        return of_corners(free, np.logical_and), visible, of_corners(near, np.logical_or)
+        part = (right >= 0) & (left <= image.camera.width) & (bottom >= 0) & (top <= image.camera.height)
+        some = [of_corners(flags, np.logical_or) for flags in (inside, near)]
+        return of_corners(free, np.logical_and), *some, part, of_corners(around, np.logical_and)
 
     def of_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
         return _of_corners(values.reshape(shape), combine)
 
     cells = occupancy.cells.copy()
-    times_seen, near_some = np.zeros(cells.shape, dtype=np.int32), np.zeros(cells.shape, dtype=bool)
-    for free, visible, near in executor.map(of_photo, images):
+    times_seen = np.zeros(cells.shape, dtype=np.int32)
+    near_some, parts_seen, around_some = np.zeros((3, *cells.shape), dtype=bool)
+    for free, visible, near, part, around in executor.map(of_photo, images):
         cells &= ~free
         times_seen += visible
         near_some |= near
+        parts_seen |= part
+        around_some |= around
     cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(images) >= MANY_PHOTOS else 2)))
-    cells &= times_seen > 0
+    cells &= ~around_some | parts_seen
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
 
 
