@@ -18,7 +18,7 @@ from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.geometry.camera import image_from_cam
 
-FREE_SHARE = 0.8
+FREE_SHARE = 0.7
 """Space is empty up to this share of the distance of known points: what has none may stand before them."""
 
 NEIGHBOURS = 8
