@@ -75,7 +75,7 @@ def test_what_no_photo_sees_is_empty_around_a_camera_only():
     nearest = np.linalg.norm(np.minimum(abs(low), abs(high)), axis=-1)
     with np.errstate(invalid="ignore"):
         behind = high[..., 2] < 0
-        assert not carved.cells[behind & (farthest < 0.7 * WALL)].any()
+        assert not carved.cells[behind & (farthest < 0.6 * WALL)].any()
         assert carved.cells[behind & (nearest > 1.1 * WALL)].all()
 
 
