@@ -62,5 +62,5 @@ def _crc32(arrays: Mapping[str, np.ndarray], text: str) -> int:
     for name in sorted(arrays):
         array = np.asarray(arrays[name], order="C")
         value = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), value)
-        value = zlib.crc32(array.reshape(-1).view(np.uint8), value)
+        value = zlib.crc32(array.reshape(-1).view(np.uint8).data, value)
     return value
