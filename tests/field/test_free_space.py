@@ -5,7 +5,7 @@ import pytest
 
 from fast_scenes import CAMERA, FRAME
 from fieldstone.field.floaters import places_in_box
-from fieldstone.field.free_space import carve_free_space, corners_in_world
+from fieldstone.field.free_space import FREE_SHARE, carve_free_space, corners_in_world
 from fieldstone.field.occupancy import full_box
 from fieldstone.field.projection import no_projection, project_points, projection_for
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
@@ -36,25 +36,30 @@ def box(unbounded):
     return full_box(np.full(3, -reach), np.full(3, 2 * reach), 48)
 
 
-def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
-    images, seen = wall_scene(3)
+def carved_before_wall(count):
+    """What the photos of the wall see of it, the box before carving and after, and the corners of its cells."""
+    images, seen = wall_scene(count)
     start = box(True)
     carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
-    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    return seen, start, carved.cells, corners_in_world(start, FRAME, no_projection(), unbounded=True)
+
+
+def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
+    seen, start, cells, corners = carved_before_wall(3)
     near, far = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
     # Cells that hold a point of the wall are kept.
     for points in seen.values():
         before_plane = 0.999 * points.xyz  # the wall itself is a plane that cells share
         places = places_in_box(FRAME.normalized_from_world.apply(before_plane), no_projection(), unbounded=True)
-        assert carved.cells[tuple(((places - start.lower) / start.cell_size).astype(int).T)].all()
+        assert cells[tuple(((places - start.lower) / start.cell_size).astype(int).T)].all()
     # A cell in front of all cameras, well before the wall, is free, and so is one behind them; one beyond it is not.
     with np.errstate(invalid="ignore"):
         middle = np.nan_to_num(0.5 * (near + far), nan=1e9)
     before = np.argmin(np.linalg.norm(middle - [0.0, 0.0, 1.5], axis=-1))
     behind = np.argmin(np.linalg.norm(middle - [0.0, 0.0, -1.0], axis=-1))
     beyond = np.argmin(np.linalg.norm(middle - [0.0, 0.0, 2 * WALL], axis=-1))
-    assert not carved.cells.reshape(-1)[[before, behind]].any()
-    assert carved.cells.reshape(-1)[beyond]
+    assert not cells.reshape(-1)[[before, behind]].any()
+    assert cells.reshape(-1)[beyond]
 
 
 def test_photos_without_points_carve_nothing():
@@ -66,17 +71,16 @@ def test_photos_without_points_carve_nothing():
 
 
 def test_what_no_photo_sees_is_empty_around_a_camera_only():
-    images, seen = wall_scene(2)
-    start = box(True)
-    carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
-    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
-    low, high = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
-    farthest = np.linalg.norm(np.maximum(abs(low), abs(high)), axis=-1)
-    nearest = np.linalg.norm(np.minimum(abs(low), abs(high)), axis=-1)
-    with np.errstate(invalid="ignore"):
-        behind = high[..., 2] < 0
-        assert not carved.cells[behind & (farthest < 0.6 * WALL)].any()
-        assert carved.cells[behind & (nearest > 1.1 * WALL)].all()
+    _, _, cells, corners = carved_before_wall(2)
+    of_cell = np.stack([corners[1 - i :, 1 - j :, 1 - k :][:48, :48, :48] for i, j, k in np.ndindex(2, 2, 2)])
+    behind, away = (of_cell[..., 2] < 0).all(axis=0), np.linalg.norm(of_cell, axis=-1)
+    # The wall is 4 away from both cameras, which are 0.05 apart.
+    around = behind & (away.max(axis=0) < FREE_SHARE * WALL)
+    elsewhere = behind & (away.min(axis=0) > WALL)
+    assert around.sum() > 1000
+    assert elsewhere.sum() > 1000
+    assert not cells[around].any()
+    assert cells[elsewhere].all()
 
 
 def test_what_too_few_photos_see_from_near_is_not_there():

@@ -2,9 +2,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from numba import njit
 
 from fast_scenes import CAMERA, RADIUS, ball_images
-from fieldstone.field.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, in_bricks, visual_hull
+from fieldstone.field.fast_field import occupancy_box
+from fieldstone.field.fast_march_numba import distance_at
+from fieldstone.field.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.05, 1.0])
@@ -19,13 +22,21 @@ def test_distances_match_brute_force(share):
     np.testing.assert_array_equal(cell_distances(cells), expected)
 
 
-def test_bricks_hold_every_value_at_its_place():
-    values = np.random.default_rng(0).integers(0, 256, (9, 4, 13), dtype=np.uint8)
-    flat, bricks = in_bricks(values)
-    assert bricks.tolist() == [3, 1, 4]
-    for cell, value in np.ndenumerate(values):
-        outer, (i, j, k) = np.array(cell) // 4, np.array(cell) % 4
-        assert flat[64 * np.ravel_multi_index(outer, bricks) + 16 * i + 4 * j + k] == value
+@njit
+def look_up(box, shape):
+    """Distances of all cells, as the kernels find them."""
+    found = np.empty(shape, np.uint8)
+    for cell in np.ndindex(shape):
+        found[cell] = distance_at(box, cell[0], cell[1], cell[2])
+    return found
+
+
+@pytest.mark.parametrize("shape", [(9, 4, 13), (1, 1, 1), (8, 5, 4)])
+def test_kernels_find_the_distance_of_every_cell(shape):
+    cells = np.random.default_rng(0).random(shape) < 0.02
+    occupancy = Occupancy(np.zeros(3), 0.5, cells)
+    box = occupancy_box(occupancy, occupancy.extent, False)
+    np.testing.assert_array_equal(look_up(box, shape), cell_distances(cells))
 
 
 @pytest.mark.parametrize("cell_size", [0.05, 0.1, 0.07, 0.31])

@@ -88,6 +88,32 @@ def test_the_exposures_of_photos_are_told_from_the_colours_of_the_scene():
     assert psnr(shown.reshape(CAMERA.height, CAMERA.width, 3), as_mean / 255.0) > 22.0
 
 
+@pytest.mark.parametrize("clear", [True, False])
+def test_a_speck_in_the_air_is_given_up_when_its_stage_begins(clear):
+    """Set by hand just before stage 3, beside spots of the same size on the ball, where there are known points."""
+    images, seen = photographed()
+    stage = 3
+    plan = replace(PLAN, clear_floaters_from=stage if clear else len(PLAN.steps))
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor, images, seen, plan)
+        state = run(work, work.start(), sum(PLAN.steps[:stage]) - 1)
+        layout, occupancy = state.field.layout, state.field.occupancy
+        state.field.table[:] = 0.0
+        layout.level(state.field.table, 0)[..., 0] = -9.0
+        centers = occupancy.centers().reshape(*occupancy.cells.shape, 3)
+        free = occupancy.cells & (abs(centers).max(axis=-1) < 1.0) & (np.linalg.norm(centers, axis=-1) > 1.4)
+        spots = RADIUS * np.vstack([np.eye(3), -np.eye(3)])
+        for place in (*spots, speck := centers[free][0]):
+            i, j, k = np.rint((place - occupancy.lower) / layout.spacings[-1]).astype(int)
+            layout.level(state.field.table, layout.num_levels - 1)[i - 1 : i + 2, j - 1 : j + 2, k - 1 : k + 2, 0] = (
+                18.0
+            )
+        state = run(work, state, 2)
+        left = state.field.density(np.vstack([spots, speck])) > 0
+    assert left[:-1].all()
+    assert left[-1] != clear
+
+
 def test_what_masks_leave_out_is_not_learned():
     """A wrong colour in a third of every photo does no harm under masks."""
     images, _ = photographed()

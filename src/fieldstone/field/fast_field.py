@@ -129,13 +129,11 @@ def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounde
     Args:
         extent: Of the grids: the last cells may reach beyond it, samples must not.
     """
-    distance, bricks = in_bricks(cell_distances(occupancy.cells))
     return Box(
         occupancy.lower.astype(np.float32),
         extent.astype(np.float32),
-        distance,
+        in_bricks(cell_distances(occupancy.cells)),
         np.array(occupancy.cells.shape, dtype=np.int64),
-        bricks,
         np.float32(occupancy.cell_size),
         unbounded,
     )

@@ -38,8 +38,6 @@ class Box(NamedTuple):
     """
     cells: np.ndarray
     """int64 (3)."""
-    bricks: np.ndarray
-    """int64 (3): bricks along each axis."""
     cell_size: np.float32
     unbounded: bool
 
@@ -77,7 +75,8 @@ class Samples(NamedTuple):
 @no_type_check
 def distance_at(box, i, j, k):
     """`Box.distance` of cell i, j, k."""
-    brick = ((i >> 2) * at(box.bricks, 1) + (j >> 2)) * at(box.bricks, 2) + (k >> 2)
+    bricks_y, bricks_z = (at(box.cells, 1) + 3) >> 2, (at(box.cells, 2) + 3) >> 2
+    brick = ((i >> 2) * bricks_y + (j >> 2)) * bricks_z + (k >> 2)
     return np.int64(at(box.distance, (brick << 6) | ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)))
 
 

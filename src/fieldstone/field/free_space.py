@@ -61,7 +61,7 @@ def carve_free_space(
     photo would ever correct what the coarse grids spread into them, and a new view may look through them.
 
     Args:
-        seen: By name of the photo, in the world; may be empty.
+        seen: By name of the photo, in the world.
         unbounded: What is beyond the box is contracted.
     """
     corners = corners_in_world(occupancy, frame, projection, unbounded=unbounded)

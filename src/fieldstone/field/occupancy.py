@@ -118,12 +118,12 @@ def grown_by_one(cells: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     return cells
 
 
-def in_bricks(values: UInt8[np.ndarray, "x y z"]) -> tuple[UInt8[np.ndarray, "n"], Int[np.ndarray, "3"]]:
-    """Values of cells brick by brick, see `fast_march_numba.Box`, and the number of bricks along each axis."""
+def in_bricks(values: UInt8[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "n"]:
+    """Values of cells brick by brick, see `fast_march_numba.Box`; the last bricks are filled up with 0."""
     bricks = -(-np.array(values.shape) // BRICK)
     padded = np.pad(values, [(0, BRICK * n - size) for n, size in zip(bricks.tolist(), values.shape, strict=True)])
     split = padded.reshape(bricks[0], BRICK, bricks[1], BRICK, bricks[2], BRICK)
-    return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1), bricks
+    return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1)
 
 
 def visual_hull(
