@@ -1,10 +1,20 @@
+from functools import partial
+
 import numpy as np
 import pytest
 
 from fieldstone.features.nearest import NO_SECOND, squared_distances, two_nearest
-from fieldstone.features.nearest_numba import BLOCK_ROWS, two_nearest_numba
+from fieldstone.features.nearest_numba import BLOCK_ROWS, HAS_BYTE_PRODUCTS, two_nearest_numba
 
-IMPLEMENTATIONS = [two_nearest, two_nearest_numba]
+KERNELS = [
+    pytest.param(partial(two_nearest_numba, by_bytes=False), id="words"),
+    pytest.param(
+        partial(two_nearest_numba, by_bytes=True),
+        id="bytes",
+        marks=pytest.mark.skipif(not HAS_BYTE_PRODUCTS, reason="this processor has no vpdpbusd"),
+    ),
+]
+IMPLEMENTATIONS = [two_nearest, *KERNELS]
 
 
 def by_sorting(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,11 +40,12 @@ def test_the_two_nearest_are_those_of_sorting(nearest, shape, high):
         np.testing.assert_array_equal(found.second, second)
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("d", [1, 2, 7, 64, 256])
-def test_kernel_agrees_with_the_reference_for_any_length(d):
+def test_kernel_agrees_with_the_reference_for_any_length(d, kernel):
     rng = np.random.default_rng(d)
     a, b = (rng.integers(0, 256, size=(n, d)).astype(np.uint8) for n in (90, 75))
-    for found, expected in zip(two_nearest_numba(a, b), two_nearest(a, b), strict=True):
+    for found, expected in zip(kernel(a, b), two_nearest(a, b), strict=True):
         np.testing.assert_array_equal(found.index, expected.index)
         np.testing.assert_array_equal(found.nearest, expected.nearest)
         np.testing.assert_array_equal(found.second, expected.second)

@@ -1,10 +1,16 @@
 """The two nearest neighbours of every descriptor, both ways, near the floor of the machine.
 
-n * m * d multiply-adds cannot be avoided; what can is waiting for memory. A tile of 4 x 16 dot products is summed in
-registers, two 16-bit products to one 32-bit sum per instruction, and compared at once with the best two so far of
-its rows and of its columns, so that no distance is ever stored. LLVM turns the products and sums of neighbours below
-into the machine's instruction for them (vpmaddwd on x86, smull and addp on ARM); loops in Python that it would
-recognise as well as these lines do not exist, hence the intrinsic.
+n * m * d multiply-adds cannot be avoided; what can is waiting for memory. A tile of 4 x 24 dot products is summed in
+registers and compared at once with the best two so far of its rows and of its columns, so that no distance is ever
+stored. Each 32-bit lane takes some neighbouring products per step:
+
+- two of 16-bit numbers, anywhere. LLVM turns the products and sums of neighbours below into the machine's instruction
+  for them (vpmaddwd on x86, smull and addp on ARM); loops in Python that it would recognise as well as these lines do
+  not exist, hence the intrinsic.
+- four of bytes, where the machine has vpdpbusd (x86 since about 2021): half the instructions and half the memory. One
+  side must be signed, so b - 128 stands for b; what that changes is the same for all of b, and goes into |a|^2.
+
+Both are exact, and give the same answer.
 """
 
 from __future__ import annotations
@@ -13,9 +19,10 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Int, UInt8
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from fieldstone.features.nearest import NO_SECOND, TwoNearest, check_descriptors
@@ -23,9 +30,18 @@ from fieldstone.features.nearest import NO_SECOND, TwoNearest, check_descriptors
 LANES = 8
 """32-bit numbers in one vector."""
 TILE_ROWS = 4
-TILE_COLUMNS = 2 * LANES
+TILE_COLUMNS = 3 * LANES
 BLOCK_ROWS = 256
 """Rows that stay in the second-level cache while all columns pass by (64 kB)."""
+
+CPU_FEATURES = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+HAS_BYTE_PRODUCTS = "+avxvnni" in CPU_FEATURES or {"+avx512vnni", "+avx512vl"} <= set(CPU_FEATURES)
+"""Whether kernels may use vpdpbusd on vectors of `LANES`."""
+SHIFT = 128
+"""What is taken from the bytes of b to make them signed."""
+
+if HAS_BYTE_PRODUCTS:
+    binding.initialize_native_asmparser()
 
 I32, I64 = ir.IntType(32), ir.IntType(64)
 SUMS = ir.VectorType(I32, LANES)
@@ -33,24 +49,31 @@ PRODUCTS = ir.VectorType(I32, 2 * LANES)
 PAIRS = ir.VectorType(ir.IntType(16), 2 * LANES)
 
 
-def two_nearest_numba(a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"]) -> tuple[TwoNearest, TwoNearest]:
+def two_nearest_numba(
+    a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"], *, by_bytes: bool = HAS_BYTE_PRODUCTS
+) -> tuple[TwoNearest, TwoNearest]:
     """The two nearest neighbours of each row of a in b, and of each row of b in a; lower indices win ties."""
     check_descriptors(a, b)
     # |a - b|^2 = |a|^2 - (2 a . b - |b|^2): for a fixed row of a, the largest score 2 a . b - |b|^2 is the nearest.
-    pairs_a = _padded(a, TILE_ROWS).astype(np.int16)
-    pairs_a *= 2
-    pairs_b = _padded(b, TILE_COLUMNS).astype(np.int16)
-    panels_b = pairs_b.reshape(len(pairs_b) // TILE_COLUMNS, TILE_COLUMNS, -1, 2).transpose(0, 2, 1, 3)
-    norm_a, norm_b = _norms(a, len(pairs_a)), _norms(b, len(pairs_b))
-    rows, columns = _empty_ranking(len(pairs_a)), _empty_ranking(len(pairs_b) // LANES)
-    _rank_numba(pairs_a, np.ascontiguousarray(panels_b), norm_a, norm_b, rows, columns, BLOCK_ROWS)
+    values = 4 if by_bytes else 2
+    padded_a, padded_b = _padded(a, TILE_ROWS, values), _padded(b, TILE_COLUMNS, values)
+    norm_a, norm_b = _norms(a, len(padded_a)), _norms(b, len(padded_b))
+    if by_bytes:
+        # a . b = a . (b - 128) + 128 sum(a)
+        norm_a[: len(a)] -= 2 * SHIFT * a.sum(axis=1, dtype=np.int32)
+        padded_b = (padded_b ^ SHIFT).view(np.int8)
+    else:
+        padded_a, padded_b = padded_a.astype(np.int16), padded_b.astype(np.int16)
+    panels_b = padded_b.reshape(len(padded_b) // TILE_COLUMNS, TILE_COLUMNS, -1, values).transpose(0, 2, 1, 3)
+    rows, columns = _empty_ranking(len(padded_a)), _empty_ranking(len(padded_b) // LANES)
+    _rank_numba(padded_a, np.ascontiguousarray(panels_b), norm_a, norm_b, rows, columns, BLOCK_ROWS)
     return _best_lane(rows, norm_a, len(a)), _every_lane(columns, norm_b, len(b))
 
 
-def _padded(descriptors: UInt8[np.ndarray, "n d"], multiple: int) -> UInt8[np.ndarray, "_ _"]:
-    """Zero rows up to a multiple, and a zero column if the number of values is odd."""
+def _padded(descriptors: UInt8[np.ndarray, "n d"], rows: int, values: int) -> UInt8[np.ndarray, "_ _"]:
+    """Zero rows and columns up to multiples of `rows` and `values`."""
     n, d = descriptors.shape
-    out = np.zeros((-(-n // multiple) * multiple, d + d % 2), dtype=np.uint8)
+    out = np.zeros((-(-n // rows) * rows, -(-d // values) * values), dtype=np.uint8)
     out[:n, :d] = descriptors
     return out
 
@@ -94,26 +117,27 @@ def _as_distances(best, second, index, norm: Int[np.ndarray, "n"]) -> TwoNearest
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _rank_numba(pairs_a, panels_b, norm_a, norm_b, rows, columns, block):
-    """Fill the rankings.  pairs_a (n, d) int16, twice the descriptors;  panels_b (m / 16, d / 2, 16, 2) int16."""
-    n, m, num_pairs = pairs_a.shape[0], norm_b.shape[0], pairs_a.shape[1] // 2
+def _rank_numba(a, panels_b, norm_a, norm_b, rows, columns, block):
+    """Fill the rankings.  a (n, d) int16 or uint8;  panels_b (m / 24, d / k, 24, k) int16, k = 2, or int8, k = 4."""
+    n, m, num_steps = a.shape[0], norm_b.shape[0], panels_b.shape[1]
     for start in range(0, n, block):
         stop = min(start + block, n)
         for j in range(0, m, TILE_COLUMNS):
             for i in range(start, stop, TILE_ROWS):
-                _rank_tile(pairs_a, panels_b, norm_a, norm_b, rows, columns, i, j, num_pairs)
+                _rank_tile(a, panels_b, norm_a, norm_b, rows, columns, i, j, num_steps)
 
 
 @intrinsic
 @no_type_check
-def _rank_tile(typing_context, pairs_a, panels_b, norm_a, norm_b, rows, columns, i, j, num_pairs):
-    """Score rows i..i+3 against columns j..j+15 and enter them into the rankings of both."""
-    signature = types.void(pairs_a, panels_b, norm_a, norm_b, rows, columns, i, j, num_pairs)
+def _rank_tile(typing_context, a, panels_b, norm_a, norm_b, rows, columns, i, j, num_steps):
+    """Score rows i..i+3 against columns j..j+23 and enter them into the rankings of both."""
+    signature = types.void(a, panels_b, norm_a, norm_b, rows, columns, i, j, num_steps)
+    add_products = _add_four_products if a.dtype == types.uint8 else _add_two_products
 
     def generate(context, builder, signature, args):
         data = [context.make_array(t)(context, builder, v).data for t, v in zip(signature.args[:6], args[:6])]  # noqa: B905
-        i, j, num_pairs = args[6:]
-        dots = _dot_tile(builder, data[0], data[1], i, j, num_pairs)
+        i, j, num_steps = args[6:]
+        dots = _dot_tile(builder, data[0], data[1], i, j, num_steps, add_products)
         _enter(builder, dots, data[2:], i, j)
         return context.get_dummy_value()
 
@@ -121,28 +145,26 @@ def _rank_tile(typing_context, pairs_a, panels_b, norm_a, norm_b, rows, columns,
 
 
 @no_type_check
-def _dot_tile(builder, pairs_a, panels_b, i, j, num_pairs):
-    """The 4 x 2 vectors of dot products of a tile."""
+def _dot_tile(builder, a, panels_b, i, j, num_steps, add_products):
+    """The 4 x 3 vectors of dot products of a tile."""
     groups = TILE_COLUMNS // LANES
-    pairs_a, panels_b = (builder.bitcast(p, ir.PointerType(I32)) for p in (pairs_a, panels_b))
+    a, panels_b = (builder.bitcast(p, ir.PointerType(I32)) for p in (a, panels_b))
     sums = [
         [cgutils.alloca_once_value(builder, ir.Constant(SUMS, [0] * LANES)) for _ in range(groups)]
         for _ in range(TILE_ROWS)
     ]
-    row_start = [builder.mul(builder.add(i, I64(r)), num_pairs) for r in range(TILE_ROWS)]
-    panel_start = builder.mul(j, num_pairs)
+    row_start = [builder.mul(builder.add(i, I64(r)), num_steps) for r in range(TILE_ROWS)]
+    panel_start = builder.mul(j, num_steps)
     for row in sums:
         for total in row:
             builder.store(ir.Constant(SUMS, [0] * LANES), total)
-    with cgutils.for_range(builder, num_pairs, intp=I64) as loop:
+    with cgutils.for_range(builder, num_steps, intp=I64) as loop:
         at = builder.add(panel_start, builder.mul(loop.index, I64(TILE_COLUMNS)))
-        across = [builder.bitcast(_load(builder, panels_b, at, g), PAIRS) for g in range(groups)]
+        across = [_load(builder, panels_b, at, g) for g in range(groups)]
         for r in range(TILE_ROWS):
-            pair = builder.load(builder.gep(pairs_a, [builder.add(row_start[r], loop.index)]))
-            down = builder.bitcast(_splat(builder, pair), PAIRS)
+            down = _splat(builder, builder.load(builder.gep(a, [builder.add(row_start[r], loop.index)])))
             for g in range(groups):
-                total = builder.add(builder.load(sums[r][g]), _sum_of_two_products(builder, down, across[g]))
-                builder.store(total, sums[r][g])
+                builder.store(add_products(builder, builder.load(sums[r][g]), down, across[g]), sums[r][g])
     return [[builder.load(total) for total in row] for row in sums]
 
 
@@ -163,8 +185,9 @@ def _enter(builder, dots, data, i, j):
         norm = _splat(builder, builder.load(builder.gep(norm_a, [row])))
         i_splat = _splat(builder, builder.trunc(row, I32))
         for g in range(groups):
-            by_row = _ranked(builder, by_row, builder.sub(dots[r][g], norms[g]), j_lanes[g])
-            by_column[g] = _ranked(builder, by_column[g], builder.sub(dots[r][g], norm), i_splat)
+            twice = builder.add(dots[r][g], dots[r][g])
+            by_row = _ranked(builder, by_row, builder.sub(twice, norms[g]), j_lanes[g])
+            by_column[g] = _ranked(builder, by_column[g], builder.sub(twice, norm), i_splat)
         _store_ranking(builder, by_row, rows, row_at)
     for g in range(groups):
         _store_ranking(builder, by_column[g], columns, group_at[g])
@@ -181,16 +204,25 @@ def _ranked(builder, ranking, score, index):
 
 
 @no_type_check
-def _sum_of_two_products(builder, x, y):
-    """x[2k] y[2k] + x[2k+1] y[2k+1] for 8 pairs of 16-bit numbers."""
-    products = builder.mul(builder.sext(x, PRODUCTS), builder.sext(y, PRODUCTS))
+def _add_four_products(builder, total, x, y):
+    """Each lane plus the sum of the products of its four bytes, unsigned in x and signed in y."""
+    # As assembly, since the types of LLVM's own function for it differ between versions.
+    kind = ir.FunctionType(SUMS, [SUMS, SUMS, SUMS])
+    return builder.asm(kind, "vpdpbusd $3, $2, $0", "=x,0,x,x", [total, x, y], side_effect=False)
+
+
+@no_type_check
+def _add_two_products(builder, total, x, y):
+    """Each lane plus the sum of the products of its two 16-bit numbers."""
+    x, y = (builder.sext(builder.bitcast(v, PAIRS), PRODUCTS) for v in (x, y))
+    products = builder.mul(x, y)
     even, odd = (
         builder.shuffle_vector(
             products, ir.Constant(PRODUCTS, ir.Undefined), ir.Constant(SUMS, list(range(k, 2 * LANES, 2)))
         )
         for k in (0, 1)
     )
-    return builder.add(even, odd)
+    return builder.add(total, builder.add(even, odd))
 
 
 @no_type_check
