@@ -34,7 +34,7 @@ TILE_COLUMNS = 3 * LANES
 BLOCK_ROWS = 256
 """Rows that stay in the second-level cache while all columns pass by (64 kB)."""
 
-CPU_FEATURES = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+CPU_FEATURES = cpu_target.target_context.codegen().magic_tuple()[2].split(",")  # pyright: ignore[reportAttributeAccessIssue]
 HAS_BYTE_PRODUCTS = "+avxvnni" in CPU_FEATURES or {"+avx512vnni", "+avx512vl"} <= set(CPU_FEATURES)
 """Whether kernels may use vpdpbusd on vectors of `LANES`."""
 SHIFT = 128

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import cv2
@@ -24,6 +25,10 @@ class SiftOptions:
     """More give no better poses on textured photos, and matching costs their square."""
     max_image_size: int = 1600
     """Photos whose longer side has more pixels are reduced to this before detection."""
+    first_look: float = 0.6
+    """Share of `max_image_size` at which photos are looked at first: it costs a third, and poses come out as exact."""
+    enough: float = 0.8
+    """Share of `max_features` at which there is no closer look."""
     contrast_threshold: float = 0.02
     """Least contrast of a feature, times 3 and relative to the full range of grey levels."""
     edge_threshold: float = 10.0
@@ -36,6 +41,10 @@ class SiftOptions:
             raise ValueError(f"max_features must be at least 1, got {self.max_features}")
         if self.max_image_size < 1:
             raise ValueError(f"max_image_size must be at least 1 pixel, got {self.max_image_size}")
+        if not 0 < self.first_look <= 1:
+            raise ValueError(f"first_look must lie in (0, 1], got {self.first_look}")
+        if not 0 <= self.enough <= 1:
+            raise ValueError(f"enough must lie in [0, 1], got {self.enough}")
         if not 0 < self.contrast_threshold < 1:
             raise ValueError(f"contrast_threshold must lie in (0, 1), got {self.contrast_threshold}")
         if self.cells_per_axis < 1:
@@ -60,15 +69,38 @@ class Sift:
         Args:
             keep: Features whose centre lies elsewhere are left out before the strongest are chosen; None: none is.
         """
-        return self.of_grey(reduced_grey(image, self.options.max_image_size), image, keep)
+        height, width = image.shape[:2]
+        for size in self.looks(width, height):
+            features = self.look(reduced_grey(image, size), image, (width, height), keep)
+            if self.enough(features):
+                break
+        return features
 
-    def of_grey(
+    def looks(self, width: int, height: int) -> tuple[int, ...]:
+        """Longer side at which a photo is looked at, one after the other until there are `enough` features."""
+        close = min(self.options.max_image_size, max(width, height))
+        first = math.ceil(self.options.first_look * self.options.max_image_size)
+        return (first, close) if first < close else (close,)
+
+    def enough(self, features: Features) -> bool:
+        """Whether a closer look is not worth its time."""
+        return len(features) >= self.options.enough * self.options.max_features
+
+    def look(
         self,
         grey: UInt8[np.ndarray, "gh gw"],
-        image: UInt8[np.ndarray, "h w 3"],
+        image: UInt8[np.ndarray, "ih iw 3"],
+        size: tuple[int, int],
         keep: Bool[np.ndarray, "h w"] | None = None,
     ) -> Features:
-        """The same, with the photo's `reduced_grey` at hand."""
+        """What one look finds.
+
+        Args:
+            grey: `reduced_grey` of the photo.
+            image: Its colours, at any size.
+            size: (width, height) of the photo, in whose pixels the features are given.
+            keep: As for the call.
+        """
         options = self.options
         detector = cv2.SIFT.create(
             # OpenCV does not know of `keep` when it chooses the strongest.
@@ -82,7 +114,7 @@ class Sift:
             enable_precise_upscale=True,
         )
         # Each axis of the photo was reduced by its own, rounded, factor.
-        zoom = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
+        zoom = np.array(size) / np.array([grey.shape[1], grey.shape[0]])
         # In one call, since a pyramid costs as much as thousands of descriptors.
         found, described = detector.detectAndCompute(grey, None)
         if not found:
@@ -98,13 +130,13 @@ class Sift:
             return _no_features()
         chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, options)]
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
-        pixels = np.clip(xy[order] * zoom, 0.0, [image.shape[1], image.shape[0]])
+        pixels = np.clip(xy[order] * zoom, 0.0, size)
         return Features(
             keypoints=pixels,
             scale=radius[order] * float(np.sqrt(zoom.prod())),
             angle=angle[order],
             descriptors=root_sift(np.asarray(described, dtype=np.uint8)[order]),
-            colors=at_pixels(image, pixels),
+            colors=at_pixels(image, pixels * (np.array([image.shape[1], image.shape[0]]) / np.array(size))),
         )
 
 

@@ -68,17 +68,18 @@ def detect(
             unit = workspace.find(STAGE, key)
             if unit is not None:
                 return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, mask=mask, **unit.facts)
-            photo = read_photo(path)
+            info = read_photo_info(path)
         except InputError as error:
-            return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
-        keep = None if mask is None else read_mask(mask, photo.info)
-        grey = reduced_grey(photo.rgb, options.sift.max_image_size)
-        features = extractor.of_grey(grey, photo.rgb, keep)
-        kept = 1.0 if keep is None else float(keep.mean())
-        facts = {"kept": kept, "sharpness": sharpness(grey)}
+            return _unusable(path, error)
+        keep = None if mask is None else read_mask(mask, info)
+        try:
+            features, sharp = _seen(extractor, info, keep)
+        except InputError as error:
+            return _unusable(path, error)
+        facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
         arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
         workspace.keep(STAGE, key, Unit(arrays, facts))
-        return SeenPhoto(photo.info, features, key, mask=mask, **facts)
+        return SeenPhoto(info, features, key, mask=mask, **facts)
 
     with one_thread_each(), ThreadPoolExecutor(options.threads) as pool:
         results = list(pool.map(one, paths))
@@ -94,6 +95,25 @@ def detect(
     workspace.forget_others(STAGE, [photo.key for photo in seen])
     check_polarity([photo.kept for photo in seen if photo.info.path in masks])
     return seen, problems
+
+
+def _unusable(path: Path, error: InputError) -> PhotoProblem:
+    return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
+
+
+def _seen(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None) -> tuple[Features, float]:
+    """Features of a photo, and its sharpness at the first look; it is decoded no larger than each look needs."""
+    features, sharp = None, None
+    for size in extractor.looks(info.width, info.height):
+        image = read_photo(info.path, at_least_px=size).rgb
+        grey = reduced_grey(image, size)
+        features = extractor.look(grey, image, (info.width, info.height), keep)
+        sharp = sharpness(grey) if sharp is None else sharp
+        if extractor.enough(features):
+            break
+    assert features is not None
+    assert sharp is not None
+    return features, sharp
 
 
 @contextmanager

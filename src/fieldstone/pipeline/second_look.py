@@ -71,6 +71,7 @@ class SecondLook:
                 sift,
                 max_features=round(MORE_FEATURES * sift.max_features),
                 contrast_threshold=sift.contrast_threshold / MORE_FEATURES,
+                first_look=1.0,
             )
         )
         features = [photo.features for photo in self.photos]
