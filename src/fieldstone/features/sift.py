@@ -16,6 +16,9 @@ DESCRIPTOR_SCALE = 512.0
 CANDIDATES = 1.6
 """Times `max_features`: so many of the strongest compete for their place in the photo."""
 
+CLOSE_BY = 0.8
+"""A first look at more than this share of the closest one would not be worth its time."""
+
 
 @dataclass(frozen=True)
 class SiftOptions:
@@ -80,7 +83,7 @@ class Sift:
         """Longer side at which a photo is looked at, one after the other until there are `enough` features."""
         close = min(self.options.max_image_size, max(width, height))
         first = math.ceil(self.options.first_look * self.options.max_image_size)
-        return (first, close) if first < close else (close,)
+        return (first, close) if first < CLOSE_BY * close else (close,)
 
     def enough(self, features: Features) -> bool:
         """Whether a closer look is not worth its time."""

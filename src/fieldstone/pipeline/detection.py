@@ -81,8 +81,12 @@ def detect(
         workspace.keep(STAGE, key, Unit(arrays, facts))
         return SeenPhoto(info, features, key, mask=mask, **facts)
 
-    with one_thread_each(), ThreadPoolExecutor(options.threads) as pool:
-        results = list(pool.map(one, paths))
+    # A photo for each thread, until there are fewer photos than threads.
+    together = len(paths) - len(paths) % options.threads
+    with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
+        results = list(pool.map(one, paths[:together]))
+    with opencv_threads(options.threads):
+        results += [one(path) for path in paths[together:]]
     problems = [result for result in results if isinstance(result, PhotoProblem)]
     first: dict[str, SeenPhoto] = {}
     for photo in (result for result in results if isinstance(result, SeenPhoto)):
@@ -117,10 +121,10 @@ def _seen(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
-    """OpenCV's own threads would only get in each other's way where every thread has a photo of its own."""
+def opencv_threads(threads: int) -> Iterator[None]:
+    """How many threads OpenCV itself takes: one where every thread of ours has a photo of its own."""
     before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(threads)
     try:
         yield
     finally:

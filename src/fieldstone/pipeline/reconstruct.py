@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -107,15 +108,16 @@ def _reconstruct(
     on_stage("mapping")
     start = time.perf_counter()
     memory = KeptGrowth(workspace)
-    run = full_size(run_mapper(mapper, material, options, memory), material)
+    photo_of = shrunk(material.photo_of)
+    with ThreadPoolExecutor(1) as meanwhile:
+        small = meanwhile.submit(thumbnails, material.graph.names, photo_of)
+        run = full_size(run_mapper(mapper, material, options, memory), material)
     seconds = {**material.seconds, "mapping": time.perf_counter() - start}
     on_stage("writing")
     start = time.perf_counter()
     write_models(run, out)
     write_covariance(run, out)
-    photo_of = shrunk(material.photo_of)
-    small = thumbnails(run.graph.names, photo_of, threads=options.matching.threads)
-    write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small)
+    write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small.result())
     seconds["writing"] = time.perf_counter() - start
     record = run_record(source, mapper, run, material, options.seed, seconds)
     # Relative, so that the two folders may move together.

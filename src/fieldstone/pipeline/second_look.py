@@ -15,7 +15,7 @@ from fieldstone.features.pairs import preview_counts
 from fieldstone.features.sift import Sift
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.mapping.rescue import MoreMatches, Wanted
-from fieldstone.pipeline.detection import SeenPhoto
+from fieldstone.pipeline.detection import SeenPhoto, opencv_threads
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
@@ -79,7 +79,8 @@ class SecondLook:
         lost = wanted.lost[:MAX_LOST]
         for v in lost:
             camera, info = wanted.cameras[self.camera_of_image[v]], self.photos[v].info
-            features[v] = richer(*self.photos[v].pixels())
+            with opencv_threads(self.options.threads):
+                features[v] = richer(*self.photos[v].pixels())
             keypoints[v] = features[v].keypoints * np.array([camera.width / info.width, camera.height / info.height])
             colors[v] = features[v].colors
         graph = replace(

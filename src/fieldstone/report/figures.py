@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -179,7 +178,6 @@ def thumbnails(
     options: FigureOptions | None = None,
     *,
     longest_px: int = 176,
-    threads: int = 1,
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
     """Small pictures of the first photos, for the verdicts."""
 
@@ -188,9 +186,8 @@ def thumbnails(
         return None if photo is None else small(photo, longest_px)
 
     chosen = names[: (options or FigureOptions()).max_thumbnails]
-    with ThreadPoolExecutor(threads) as pool:
-        pictures = pool.map(thumbnail, chosen)
-        return {name: picture for name, picture in zip(chosen, pictures, strict=True) if picture is not None}
+    pictures = ((name, thumbnail(name)) for name in chosen)
+    return {name: picture for name, picture in pictures if picture is not None}
 
 
 def pairs_to_show(graph: MatchGraph, initial: ImagePair | None, at_most: int) -> list[ImagePair]:
