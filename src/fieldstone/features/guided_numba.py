@@ -12,7 +12,7 @@ from fieldstone.features.matching import mutual_and_distinct
 from fieldstone.features.nearest import NO_SECOND, TwoNearest
 from fieldstone.scene.features import Features
 
-STRIP_PX = 24.0
+STRIP_PX = 160.0
 """Keypoints are filed in upright strips of this width, from top to bottom within each."""
 
 
@@ -22,18 +22,12 @@ def match_guided_numba(
     """`guided.match_guided` by a walk along each epipolar line through the strips of the other photo."""
     if not len(a) or not len(b):
         return np.empty((0, 2), dtype=np.int64)
-    F = np.ascontiguousarray(image2_F_image1, dtype=np.float64)
-    from_a = _search(a, b, F, max_error_px)
-    from_b = _search(b, a, np.ascontiguousarray(F.T), max_error_px)
-    return mutual_and_distinct(from_a, from_b, max_ratio)
-
-
-def _search(a: Features, b: Features, F: Float[np.ndarray, "3 3"], max_error_px: float) -> TwoNearest:
     left = float(b.keypoints[:, 0].min())
     strip = ((b.keypoints[:, 0] - left) / STRIP_PX).astype(np.int64)
     order = np.lexsort((b.keypoints[:, 1], strip))
     strip_start = np.searchsorted(strip[order], np.arange(int(strip.max()) + 2))
-    index, nearest, second = _nearest_along_lines(
+    from_a, from_b = _none_yet(len(a)), _none_yet(len(b))
+    _rank_along_lines(
         np.ascontiguousarray(a.keypoints),
         np.ascontiguousarray(a.descriptors),
         np.ascontiguousarray(b.keypoints[order]),
@@ -41,10 +35,17 @@ def _search(a: Features, b: Features, F: Float[np.ndarray, "3 3"], max_error_px:
         order,
         strip_start,
         left,
-        F,
+        np.ascontiguousarray(image2_F_image1, dtype=np.float64),
         max_error_px,
+        from_a,
+        from_b,
     )
-    return TwoNearest(index, nearest, second)
+    return mutual_and_distinct(TwoNearest(*from_a), TwoNearest(*from_b), max_ratio)
+
+
+def _none_yet(n: int) -> Int[np.ndarray, "3 n"]:
+    """Index, squared distance of the nearest and of the second nearest."""
+    return np.repeat(np.array([[-1], [NO_SECOND], [NO_SECOND]], dtype=np.int64), n, axis=1)
 
 
 @njit(cache=True)
@@ -59,15 +60,26 @@ def _band(la, lb, lc, x0, x1, width):
     return min(p, q) - 0.5, max(p, q) + 0.5
 
 
+@njit(cache=True)
+@no_type_check
+def _enter(ranking, i, other, distance):
+    """Compare one more distance with the best two of feature i; of equal ones the lower index wins."""
+    if distance < ranking[1, i] or (distance == ranking[1, i] and other < ranking[0, i]):
+        ranking[2, i] = ranking[1, i]
+        ranking[1, i] = distance
+        ranking[0, i] = other
+    elif distance < ranking[2, i]:
+        ranking[2, i] = distance
+
+
 @njit(cache=True, nogil=True)
 @no_type_check
-def _nearest_along_lines(pixels_a, bytes_a, pixels_b, bytes_b, order, strip_start, left, F, max_error):
-    """(n) index, (n) nearest, (n) second nearest squared distance.  b sorted by strip, then y; order (m)."""
-    n = pixels_a.shape[0]
-    index = np.full(n, -1, dtype=np.int64)
-    nearest = np.full(n, NO_SECOND, dtype=np.int64)
-    second = np.full(n, NO_SECOND, dtype=np.int64)
-    for i in range(n):
+def _rank_along_lines(pixels_a, bytes_a, pixels_b, bytes_b, order, strip_start, left, F, max_error, from_a, from_b):
+    """Fill the rankings (3, n) and (3, m).  b sorted by strip, then y; order (m).
+
+    Near the line of the other is near both ways, so that one distance serves both rankings.
+    """
+    for i in range(pixels_a.shape[0]):
         x, y = pixels_a[i, 0], pixels_a[i, 1]
         la = F[0, 0] * x + F[0, 1] * y + F[0, 2]
         lb = F[1, 0] * x + F[1, 1] * y + F[1, 2]
@@ -79,6 +91,8 @@ def _nearest_along_lines(pixels_a, bytes_a, pixels_b, bytes_b, order, strip_star
                 continue
             x0, x1 = left + s * STRIP_PX, left + (s + 1) * STRIP_PX
             top, bottom = _band(la, lb, lc, x0, x1, width2)
+            if pixels_b[last - 1, 1] < top or pixels_b[first, 1] > bottom:
+                continue
             while first < last:
                 middle = (first + last) // 2
                 if pixels_b[middle, 1] < top:
@@ -90,18 +104,15 @@ def _nearest_along_lines(pixels_a, bytes_a, pixels_b, bytes_b, order, strip_star
                 if v > bottom:
                     break
                 offset = abs(la * u + lb * v + lc)
+                if offset > width2:
+                    continue
                 ma = F[0, 0] * u + F[1, 0] * v + F[2, 0]
                 mb = F[0, 1] * u + F[1, 1] * v + F[2, 1]
-                if offset > width2 or offset > max_error * np.sqrt(ma * ma + mb * mb):
+                if offset > max_error * np.sqrt(ma * ma + mb * mb):
                     continue
                 distance = 0
                 for d in range(bytes_a.shape[1]):
                     difference = np.int32(bytes_a[i, d]) - np.int32(bytes_b[k, d])
                     distance += difference * difference
-                if distance < nearest[i] or (distance == nearest[i] and order[k] < index[i]):
-                    second[i] = nearest[i]
-                    nearest[i] = distance
-                    index[i] = order[k]
-                elif distance < second[i]:
-                    second[i] = distance
-    return index, nearest, second
+                _enter(from_a, i, order[k], distance)
+                _enter(from_b, order[k], i, distance)
