@@ -1,4 +1,4 @@
-"""Photos to poses, ours against pycolmap, interleaved on one folder: time, coverage and accuracy.
+"""Photos to poses, ours against pycolmap and openmvg-rs, interleaved on one folder: time, coverage and accuracy.
 
     python -m benchmarks.sfm FOLDER [FOLDER ...] [--known-intrinsics] [--runs 3] [--threads 2] [--size 1600]
 
@@ -30,7 +30,8 @@ from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 
 THRESHOLDS_DEG = (0.5, 1.0, 3.0, 5.0, 10.0)
-PEERS = ("fieldstone", "incremental", "global")
+PEERS = ("fieldstone", "incremental", "global", "openmvg")
+"""The second and third are pycolmap's mappers."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def main() -> None:
         rows = []
         for seed in range(arguments.runs):
             setting = Setting(photos, arguments.size, arguments.threads, seed, intrinsics)
-            rows += [measure(peer, setting, truth) for peer in arguments.only or PEERS]
+            rows += [measure(peer, setting, truth) for peer in arguments.only or PEERS[:3]]
         show(folder.name, rows)
 
 
@@ -75,6 +76,8 @@ def measure(peer: str, setting: Setting, truth: Reconstruction | None) -> dict[s
     """One run of one side in a process of its own."""
     out = Path(tempfile.mkdtemp(prefix=f"bench-{peer}-"))
     environment = {**os.environ, "OMP_NUM_THREADS": str(setting.threads)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its bytecode
+    given = json.dumps({**vars(setting), "photos": str(setting.photos)})
     if peer == "fieldstone":
         command = [
             sys.executable, "-m", "fieldstone.cli", "reconstruct", str(setting.photos), "-o", str(out),
@@ -82,9 +85,10 @@ def measure(peer: str, setting: Setting, truth: Reconstruction | None) -> dict[s
         ]  # fmt: skip
         if setting.intrinsics:
             command += ["--intrinsics", setting.intrinsics, "--fix-intrinsics"]
+    elif peer == "openmvg":
+        command = [sys.executable, "-m", "benchmarks.openmvg_runner", given, str(out)]
     else:
-        arguments = json.dumps({**vars(setting), "photos": str(setting.photos)})
-        command = [sys.executable, "-m", "benchmarks.pycolmap_runner", peer, arguments, str(out)]
+        command = [sys.executable, "-m", "benchmarks.pycolmap_runner", peer, given, str(out)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -103,6 +107,8 @@ def measure(peer: str, setting: Setting, truth: Reconstruction | None) -> dict[s
     stages = out / "run.json"
     if stages.is_file():
         row["stages"] = json.loads(stages.read_text())["seconds"]
+        if peer == "openmvg":  # without reading and reducing the photos
+            row["wall_s"] = row["stages"]["everything"]
     if done.returncode not in (0, 4):
         row["error"] = done.stderr.strip()[-300:]
     shutil.rmtree(out)

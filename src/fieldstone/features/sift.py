@@ -30,7 +30,7 @@ class SiftOptions:
     """Photos whose longer side has more pixels are reduced to this before detection."""
     first_look: float = 0.55
     """Share of `max_image_size` at which photos are looked at first: it costs a third, and poses come out as exact."""
-    enough: float = 0.8
+    enough: float = 0.6
     """Share of `max_features` at which there is no closer look."""
     contrast_threshold: float = 0.02
     """Least contrast of a feature, times 3 and relative to the full range of grey levels."""
