@@ -1,10 +1,12 @@
 import pickle
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduced_grey, root_sift, spread
+from fieldstone.pipeline.detection import opencv_threads
 
 
 def blob(x: float, y: float, sigma: float, width: int = 180, height: int = 160) -> np.ndarray:
@@ -123,6 +125,8 @@ def test_options_refuse_nonsense():
         lambda: SiftOptions(max_features=0),
         lambda: SiftOptions(max_image_size=0),
         lambda: SiftOptions(contrast_threshold=0.0),
+        lambda: SiftOptions(first_look=0.0),
+        lambda: SiftOptions(enough=1.5),
         lambda: SiftOptions(cells_per_axis=0),
     ):
         with pytest.raises(ValueError):
@@ -153,3 +157,53 @@ def test_the_strongest_alone_are_described_as_among_all():
     of = {(*k, a): d for k, a, d in zip(everything.keypoints, everything.angle, everything.descriptors, strict=True)}
     for keypoint, angle, descriptor in zip(few.keypoints, few.angle, few.descriptors, strict=True):
         np.testing.assert_array_equal(descriptor, of[(*keypoint, angle)])
+
+
+@pytest.mark.parametrize(
+    ("size", "looks"),
+    [((3000, 2000), (880, 1600)), ((1500, 1000), (880, 1500)), ((1000, 1050), (1050,)), ((80, 60), (80,))],
+)
+def test_a_first_look_is_coarser_where_that_saves_time(size, looks):
+    assert Sift().looks(*size) == looks
+    assert Sift(SiftOptions(first_look=1.0)).looks(*size) == looks[-1:]
+
+
+def test_enough_features_at_the_first_look_are_all_there_is():
+    image = texture(3, 640, 480)
+    options = SiftOptions(max_features=40, max_image_size=640, first_look=0.5)
+    found, coarse = Sift(options)(image), Sift(replace(options, max_image_size=320, first_look=1.0))(image)
+    assert len(found) >= options.enough * options.max_features
+    np.testing.assert_array_equal(found.keypoints, coarse.keypoints)
+    np.testing.assert_array_equal(found.descriptors, coarse.descriptors)
+    np.testing.assert_array_equal(found.colors, coarse.colors)
+
+
+def test_too_few_features_are_worth_a_closer_look():
+    image = texture(3, 640, 480)
+    options = SiftOptions(max_features=10**5, max_image_size=640, first_look=0.5)
+    found, close = Sift(options)(image), Sift(replace(options, first_look=1.0))(image)
+    np.testing.assert_array_equal(found.keypoints, close.keypoints)
+    np.testing.assert_array_equal(found.descriptors, close.descriptors)
+
+
+def test_a_smaller_picture_of_the_photo_gives_features_in_its_pixels():
+    image = texture(3, 640, 480)
+    small = np.asarray(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    found = Sift(SiftOptions(max_image_size=320)).look(reduced_grey(small, 320), small, (640, 480))
+    alone = Sift(SiftOptions(max_image_size=320))(small)
+    np.testing.assert_allclose(found.keypoints, 2 * alone.keypoints, rtol=1e-12)
+    np.testing.assert_allclose(found.scale, 2 * alone.scale, rtol=1e-12)
+    np.testing.assert_array_equal(found.colors, alone.colors)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_of_opencv_change_nothing(threads):
+    image = texture(5, 640, 480)
+    extractor = Sift(SiftOptions(max_features=300))
+    with opencv_threads(1):
+        alone = extractor(image)
+    with opencv_threads(threads):
+        found = extractor(image)
+        assert cv2.getNumThreads() == threads
+    np.testing.assert_array_equal(found.keypoints, alone.keypoints)
+    np.testing.assert_array_equal(found.descriptors, alone.descriptors)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import cv2
@@ -82,7 +81,7 @@ class Sift:
     def looks(self, width: int, height: int) -> tuple[int, ...]:
         """Longer side at which a photo is looked at, one after the other until there are `enough` features."""
         close = min(self.options.max_image_size, max(width, height))
-        first = math.ceil(self.options.first_look * self.options.max_image_size)
+        first = max(round(self.options.first_look * self.options.max_image_size), 1)
         return (first, close) if first < CLOSE_BY * close else (close,)
 
     def enough(self, features: Features) -> bool:
