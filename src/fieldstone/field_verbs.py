@@ -117,10 +117,10 @@ def render(
     source: Source,
     /,
     *,
-    path: Literal["orbit", "spiral", "through"] = "orbit",
+    path: str = "orbit",
     format: Literal["mp4", "gif", "png"] = "mp4",
-    show: Literal["color", "depth", "normals", "opacity"] = "color",
-    frames: int = 120,
+    show: Literal["color", "depth", "normals", "opacity", "confidence"] = "color",
+    frames: int | None = None,
     fps: int = 30,
     size: int | None = None,
     device: str = "cpu",
@@ -131,10 +131,12 @@ def render(
     Args:
         source: Folder that `train` wrote; the film goes to its folder renders.
         path: orbit goes around what the photos look at, spiral loops near their middle, through goes from one to
-            the next.
+            the next; dataset takes the poses of the training photos, FILE.json those of a file: frames as in
+            transforms.json, or a camera_path of nerfstudio in the world of the photos.
         format: mp4 and gif give one file, png a folder of images.
-        show: color; depth, near is bright; normals as colours, x to the right, y up, z to the camera; opacity.
-        frames: Number of images.
+        show: color; depth, near is bright; normals as colours, x to the right, y up, z to the camera; opacity;
+            confidence, how many photos determine what is seen.
+        frames: Number of images; by default 120, or one for each pose of dataset and files.
         fps: Images per second.
         size: Longer side in pixels; by default as trained.
         device: cpu, cuda, mps.
@@ -146,7 +148,7 @@ def render(
 
     console = plain_console()
     with Progress(console=console) as progress:
-        task = progress.add_task("rendering", total=frames)
+        task = progress.add_task("rendering", total=None)
         target = render_run(
             source,
             path=path,
@@ -157,9 +159,9 @@ def render(
             size_px=size,
             device=device,
             threads=threads or None,
-            on_frame=lambda done, total: progress.update(task, completed=done),
+            on_frame=lambda done, total: progress.update(task, completed=done, total=total),
         )
-    console.print(f"{frames} images -> {target}", markup=False)
+    console.print(f"rendered -> {target}", markup=False)
     return 0
 
 

@@ -241,6 +241,15 @@ def test_render_formats(tmp_path):
     folder = render_run(out, path="spiral", fmt="png", frames=2, size_px=40, threads=1)
     assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png"]
     assert read_photo(folder / "0000.png").rgb.shape == (32, 40, 3)
+    assert len(list(render_run(out, path="dataset", fmt="png", threads=1).iterdir())) == 6
+    given = tmp_path / "walk.json"
+    given.write_text(json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}] * 2}))
+    assert render_run(out, path=str(given), fmt="gif", threads=1).name == "walk.gif"
+    shown = render_run(out, path=str(given), fmt="png", show="confidence", frames=5, threads=1)
+    assert shown.name == "walk_confidence"
+    assert len(list(shown.iterdir())) == 5
+    with pytest.raises(InputError, match="--path sideways: give one of orbit"):
+        render_run(out, path="sideways")
     with pytest.raises(InputError, match="at least 1"):
         render_run(out, frames=0)
     with pytest.raises(InputError, match="fieldstone train"):

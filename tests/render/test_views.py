@@ -5,7 +5,7 @@ from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render import views
-from fieldstone.render.views import RenderedView, depth_image, normal_image, render_view
+from fieldstone.render.views import RenderedView, confidence_image, depth_image, normal_image, render_view
 
 
 def render_ball(rays):
@@ -63,3 +63,27 @@ def test_depth_is_bright_where_it_is_near():
     view = RenderedView(np.zeros((1, 4, 3)), depth, np.array([[1.0, 1, 1, 0]]))
     # Linear in 1 / depth from 1 at 2 to 0 at 8; nothing is seen at the last pixel.
     np.testing.assert_allclose(depth_image(view, 2.0, 8.0)[0, :, 0], [1.0, 1 / 3, 0.0, 0.0])
+
+
+def test_confidence_counts_the_photos_that_see_a_point_from_the_same_side():
+    camera = Camera("PINHOLE", 8, 6, np.array([8.0, 8.0, 4.0, 3.0]))
+    here, opposite = Rigid3.identity(), Rigid3(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 10.0]))
+    aside = Rigid3(np.eye(3), np.array([-100.0, 0.0, 0.0]))
+    rays = views.rays_from_view(camera, here)
+    wall = (5.0 / rays.directions[:, 2]).reshape(6, 8)
+    opacity = np.full((6, 8), 0.8)
+    view = RenderedView(np.zeros((6, 8, 3)), wall, opacity)
+    for photos, share in (
+        ([], 0.0),
+        ([here], 0.0),
+        ([here, opposite, aside], 0.0),
+        ([here] * 2, 0.5),
+        ([here, here, here, opposite], 0.75),
+    ):
+        found = confidence_image(view, camera, here, [(camera, pose) for pose in photos])
+        np.testing.assert_allclose(found, 0.8 * share, atol=1e-12)
+    # A photo moved by half its width sees half of the wall: 2.5 units are 4 pixels at 8 pixels focal length, depth 5.
+    half = Rigid3(np.eye(3), np.array([-2.5, 0.0, 0.0]))
+    found = confidence_image(view, camera, here, [(camera, here), (camera, half)])[:, :, 0]
+    np.testing.assert_allclose(found[:, :4], 0.0)
+    np.testing.assert_allclose(found[:, 4:], 0.4)

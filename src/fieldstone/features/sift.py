@@ -28,7 +28,7 @@ class SiftOptions:
     max_image_size: int = 1600
     """Photos whose longer side has more pixels are reduced to this before detection."""
     first_look: float = 0.65
-    """Share of `max_image_size` at which photos are looked at first: it costs less than half, and poses come out as exact."""
+    """Share of `max_image_size` at which photos are looked at first: less than half the time, and poses as exact."""
     enough: float = 0.6
     """Share of `max_features` at which there is no closer look."""
     contrast_threshold: float = 0.02
@@ -72,6 +72,7 @@ class Sift:
             keep: Features whose centre lies elsewhere are left out before the strongest are chosen; None: none is.
         """
         height, width = image.shape[:2]
+        features = _no_features()
         for size in self.looks(width, height):
             features = self.look(reduced_grey(image, size), image, (width, height), keep)
             if self.enough(features):

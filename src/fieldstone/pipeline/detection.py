@@ -107,16 +107,17 @@ def _unusable(path: Path, error: InputError) -> PhotoProblem:
 
 def _seen(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None) -> tuple[Features, float]:
     """Features of a photo, and its sharpness at the first look; it is decoded no larger than each look needs."""
-    features, sharp = None, None
-    for size in extractor.looks(info.width, info.height):
+
+    def look(size: int) -> tuple[Features, float]:
         image = read_photo(info.path, at_least_px=size).rgb
         grey = reduced_grey(image, size)
-        features = extractor.look(grey, image, (info.width, info.height), keep)
-        sharp = sharpness(grey) if sharp is None else sharp
-        if extractor.enough(features):
-            break
-    assert features is not None
-    assert sharp is not None
+        return extractor.look(grey, image, (info.width, info.height), keep), sharpness(grey)
+
+    first, *closer = extractor.looks(info.width, info.height)
+    features, sharp = look(first)
+    for size in closer:
+        if not extractor.enough(features):
+            features, _ = look(size)
     return features, sharp
 
 

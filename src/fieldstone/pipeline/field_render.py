@@ -19,27 +19,30 @@ from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world
 from fieldstone.field.training import TrainOptions
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.camera_path_json import read_camera_path
 from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.io.photos import write_photo
 from fieldstone.io.video import write_gif, write_mp4
 from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
 from fieldstone.render.camera_paths import orbit, spiral, through
-from fieldstone.render.views import RenderedView, depth_image, normal_image, render_view
+from fieldstone.render.views import RenderedView, confidence_image, depth_image, normal_image, render_view
 
-PathName = Literal["orbit", "spiral", "through"]
 FilmFormat = Literal["mp4", "gif", "png"]
-Shown = Literal["color", "depth", "normals", "opacity"]
+Shown = Literal["color", "depth", "normals", "opacity", "confidence"]
 
 PATHS: dict[str, Callable[[Rigid3, int], Rigid3]] = {"orbit": orbit, "spiral": spiral, "through": through}
+
+FRAMES = 120
+"""Images of a path that is made up."""
 
 
 def render_run(
     out: Path,
     *,
-    path: PathName = "orbit",
+    path: str = "orbit",
     fmt: FilmFormat = "mp4",
     show: Shown = "color",
-    frames: int = 120,
+    frames: int | None = None,
     fps: int = 30,
     size_px: int | None = None,
     device: str = "cpu",
@@ -50,25 +53,30 @@ def render_run(
 
     Args:
         path: orbit: around what the photos look at. spiral: loops about their mean. through: from photo to photo.
+            dataset: the poses of the training photos. Else a JSON file with poses, see `io.camera_path_json`.
         fmt: mp4 and gif give one file, png a folder of numbered images.
-        show: Colours, depth, normals or opacity.
+        show: Colours, depth, normals, opacity or confidence.
+        frames: Number of images; None: one for each pose of dataset and files, 120 for the other paths. Another number
+            of a file's poses leads through them.
         size_px: Longer side of the images; None: as trained.
         on_frame: Called with the number of frames done and of all.
 
     Returns:
-        The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/; PATH_depth and so on for
-        what is not colour.
+        The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/, with the name of a file for
+        PATH; PATH_depth and so on for what is not colour.
 
     Raises:
-        InputError: No usable checkpoint in `out`.
+        InputError: No usable checkpoint in `out`, or no such path.
     """
-    if frames < 1 or fps < 1 or (size_px is not None and size_px < 1):
+    if (frames is not None and frames < 1) or fps < 1 or (size_px is not None and size_px < 1):
         raise InputError(f"frames, fps and size must be at least 1, got {frames}, {fps}, {size_px}")
     tensors, header = read_checkpoint(out / CHECKPOINT)
     poses, state_tensors = split_tensors(tensors)
     frame = frame_from_header(header)
     camera = _camera(header["cameras"][0], size_px)
-    poses_on_path = PATHS[path](poses, frames)
+    name, poses_on_path = _poses_on(path, poses, frames)
+    frames = len(poses_on_path.t)
+    photos = _photos(header, poses)
     threads = threads or os.cpu_count() or 1
     with open_renderer(header, state_tensors, frame, device=device, threads=threads) as render_normalized:
         render_rays = in_world(render_normalized, frame)
@@ -78,10 +86,13 @@ def render_run(
         def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             for k in range(frames):
                 view = render_view(render_rays, camera, poses_on_path[k])
-                yield quantize(_shown(view, show, camera, near, far))
+                if show == "confidence":
+                    yield quantize(confidence_image(view, camera, poses_on_path[k], photos).astype(np.float32))
+                else:
+                    yield quantize(_shown(view, show, camera, near, far))
                 on_frame(k + 1, frames)
 
-        name = path if show == "color" else f"{path}_{show}"
+        name = name if show == "color" else f"{name}_{show}"
         target = out / "renders" / (name if fmt == "png" else f"{name}.{fmt}")
         if fmt == "mp4":
             write_mp4(target, images(), fps=fps)
@@ -91,6 +102,22 @@ def render_run(
             for k, image in enumerate(images()):
                 write_photo(target / f"{k:04d}.png", image)
     return target
+
+
+def _poses_on(path: str, poses: Rigid3, frames: int | None) -> tuple[str, Rigid3]:
+    """The name of a path for its file, and its poses."""
+    if path in PATHS:
+        return path, PATHS[path](poses, frames or FRAMES)
+    if path != "dataset" and not path.lower().endswith(".json"):
+        raise InputError(f"--path {path}: give one of {', '.join(PATHS)}, dataset, or a file PATH.json with poses")
+    name, given = (path, poses) if path == "dataset" else (Path(path).stem, read_camera_path(Path(path)))
+    return name, given if frames in (None, len(given.t)) else through(given, frames)
+
+
+def _photos(header: Mapping[str, Any], poses: Rigid3) -> list[tuple[Camera, Rigid3]]:
+    """Camera and pose of every training photo."""
+    cameras = [_camera(stored, None) for stored in header["cameras"]]
+    return [(cameras[c], poses[k]) for k, c in enumerate(header["camera_of_view"])]
 
 
 def _shown(view: RenderedView, show: Shown, camera: Camera, near: float, far: float) -> Float[np.ndarray, "h w 3"]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from fieldstone.field.radiance_field import RayRenderer
-from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.rays import Rays, rays_from_view
 
 RAYS_AT_ONCE = 1 << 16
+
+SAME_SIDE = 0.5
+"""Cosine of the angle up to which a photo sees the same side of a surface as a view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,34 @@ def normal_image(view: RenderedView, camera: Camera) -> Float[np.ndarray, "h w 3
     normals = np.where(facing > 0, -normals, normals) * [1.0, -1.0, -1.0]
     seen = (view.opacity > 0.5)[:, :, None] & np.isfinite(normals)
     return np.where(seen, 0.5 + 0.5 * normals, 0.0)
+
+
+def confidence_image(
+    view: RenderedView, camera: Camera, cam_from_world: Rigid3, photos: Sequence[tuple[Camera, Rigid3]]
+) -> Float[np.ndarray, "h w 3"]:
+    """How well the photos determine what each pixel shows: opacity times 1 - 2^(1 - n), 0 for n = 0.
+
+    n is the number of photos that have the point in their picture and look at it from within 60 degrees of the view:
+    one alone leaves the depth open, every further one halves the doubt. Whether something hides the point from a
+    photo is not asked.
+
+    Args:
+        photos: Camera and `cam_from_world` of each.
+    """
+    rays = rays_from_view(camera, cam_from_world)
+    points = rays.origins + rays.directions * view.depth.reshape(-1, 1)
+    seen = np.zeros(len(points), dtype=np.int64)
+    for photo, pose in photos:
+        in_cam = pose.apply(points)
+        towards = points - pose.target_origin_in_source()
+        length = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+        aligned = np.sum(towards * rays.directions, axis=1) > SAME_SIDE * length
+        candidate = np.flatnonzero(aligned & (in_cam[:, 2] > 0) & np.isfinite(in_cam).all(axis=1))
+        pixels = image_from_cam(photo, in_cam[candidate])
+        inside = np.all((pixels >= 0) & (pixels < [photo.width, photo.height]), axis=1)
+        seen[candidate[inside]] += 1
+    share = np.where(seen > 0, 1.0 - 0.5 ** np.maximum(seen - 1.0, 0.0), 0.0).reshape(view.opacity.shape)
+    return np.repeat((share * view.opacity)[:, :, None], 3, axis=2)
 
 
 def render_view(render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3) -> RenderedView:
