@@ -37,6 +37,7 @@ def train(
     photos: Path | None = None,
     masks: Path | None = None,
     size: int | None = None,
+    refine_poses: bool = False,
     device: str = "cpu",
     threads: int = 0,
     seed: int = 0,
@@ -59,6 +60,8 @@ def train(
         masks: Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. Nothing is learned where
             they are black, nor measured; by default those of the reconstruction (fast only).
         size: Photos are reduced to this length of their longer side, in pixels (fast only).
+        refine_poses: Move the training photos a little, so that the field fits them; known points of a reconstruction
+            hold them (fast only).
         device: cpu, cuda, mps (tiny and nerf).
         threads: 0 takes all cores. The result is the same for any number.
         seed: Every random number of the run follows from it.
@@ -72,6 +75,8 @@ def train(
         raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
     if field != "fast" and (masks is not None or size is not None):
         raise InputError(f"--masks and --size belong to the fast field; leave them out for --field {field}")
+    if field != "fast" and refine_poses:
+        raise InputError(f"--refine-poses belongs to the fast field; leave it out for --field {field}")
     if size is not None and size < 1:
         raise InputError(f"--size {size}: the longer side of a photo has at least one pixel")
     if field == "fast" and device != "cpu":
@@ -98,7 +103,16 @@ def train(
         if field == "fast":
             if size is not None:
                 shared["size_px"] = size
-            metrics = train_fast_run(source, out, plan=plan, use_alpha=alpha, memory_gib=memory, masks=masks, **shared)
+            metrics = train_fast_run(
+                source,
+                out,
+                plan=plan,
+                use_alpha=alpha,
+                memory_gib=memory,
+                masks=masks,
+                refine_poses=refine_poses,
+                **shared,
+            )
         else:
             metrics = train_run(source, out, field=field, device=device, **shared)
     done = f"{metrics['steps']} steps in {metrics['seconds']:.0f} s"

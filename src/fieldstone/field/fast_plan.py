@@ -73,6 +73,8 @@ class FastPlan:
     """Step of the logarithm of a photo's exposure, at the start of training; 0: all photos are alike."""
     point_weight: float = 0.0
     """Weight of light that misses a known point against the squared colour error of its ray; falls with the rates."""
+    refine_poses: bool = False
+    """Move the photos between stages so that the field fits them, see `pose_refinement`."""
     stop_after: int | None = None
     """Where training stopped because the time was over, if the machine became slower than any correction foresaw."""
 

@@ -32,6 +32,7 @@ from fieldstone.field.fast_field import (
 from fieldstone.field.fast_grid import CHANNELS, grid_layout
 from fieldstone.field.fast_plan import FastPlan, plan_from_json
 from fieldstone.field.fast_rays import RayTable, ray_table
+from fieldstone.field.fast_state import FastState, grown, next_rays
 from fieldstone.field.fast_step_numba import chunk_step
 from fieldstone.field.fast_terms_numba import PointRays, Terms
 from fieldstone.field.fast_update import move_grid, step_decoder
@@ -41,9 +42,10 @@ from fieldstone.field.free_space import carve_free_space
 from fieldstone.field.known_points import known_rays, no_known_rays
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
 from fieldstone.field.occupancy_numba import used_cells
+from fieldstone.field.pose_refinement import MovablePhoto, movable_photos, moved_images, refined
 from fieldstone.field.projection import Projection, no_projection, projection_for
-from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport
-from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport, in_world
+from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints, poses_in_frame
 from fieldstone.geometry.rigid3 import Rigid3
 
 logger = logging.getLogger(__name__)
@@ -56,6 +58,9 @@ PRUNE_AT = (0.25, 0.6)
 
 SOLID = 0.1
 """A cell is solid where a step takes this optical depth."""
+
+POSES_AT = (2, 3, 4, 5, 6)
+"""Stages that begin with refined poses, if the plan has them: what coarse grids show is too blurred to tell."""
 
 LAST_PRUNED = 4
 """Stages after this one give up cells when they begin, and not again: there is hardly anything left to give up."""
@@ -80,27 +85,6 @@ FREE_CELLS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class FastState:
-    """Everything that the next step depends on. The arrays are updated in place by `FastTraining.step`."""
-
-    plan: FastPlan
-    step: int
-    cursor: int
-    """Rays drawn so far."""
-    chunk_rays: Int[np.ndarray, "c"]
-    """Rays that each chunk should draw next to fill its room."""
-    field: FastField
-    velocity: Float[np.ndarray, "t"]
-    """Mean squared gradient of each value of the grid."""
-    decoder_mean: Decoder
-    decoder_square: Decoder
-    exposure: Exposure
-    """Of every photo; all 1 unless the plan says that they are learned."""
-    workspace: Workspace
-    """Room for the next step; follows from the rest."""
-
-
-@dataclass(frozen=True, eq=False)
 class FastTraining:
     """Trains a fast field on a table of rays; a `FieldTraining`."""
 
@@ -121,6 +105,8 @@ class FastTraining:
     """Known points, in the space of the grids."""
     alpha_known: bool
     """Photos say themselves where they show the background."""
+    movable: tuple[MovablePhoto, ...] = ()
+    """The photos whose poses may be refined; none, if they may not."""
 
     def start(self) -> FastState:
         """The state before the first step."""
@@ -144,7 +130,9 @@ class FastTraining:
         rays = np.full(plan.num_chunks, plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))
         velocity, exposure = np.zeros_like(table), unit_exposure(self.num_images)
-        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, exposure, self._workspace(field, plan))
+        moved = np.zeros((self.num_images, 6))
+        room = self._workspace(field, plan)
+        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, exposure, moved, self.rays, room)
 
     @property
     def num_images(self) -> int:
@@ -177,7 +165,7 @@ class FastTraining:
             state,
             step=state.step + 1,
             cursor=int(starts[-1]),
-            chunk_rays=_next_rays(rays, counts, plan.samples_per_chunk),
+            chunk_rays=next_rays(rays, counts, plan.samples_per_chunk),
         )
         return state, StepReport(loss=mse, mse=mse)
 
@@ -197,7 +185,7 @@ class FastTraining:
 
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
-                self.rays, int(starts[c]), int(state.chunk_rays[c]), self.known, self.points,
+                state.rays, int(starts[c]), int(state.chunk_rays[c]), self.known, self.points,
                 int(starts[c]) // RAYS_PER_KNOWN, int(num_known[c]), self.projection, gains, self.seed, background,
                 room.grid, room.box, room.march, FOREVER, terms, field.decoder, transposed, field.width,
                 room.chunks[c],
@@ -222,10 +210,28 @@ class FastTraining:
         if plan.scout and stage == 1 and into_stage == 0:
             found = self._first_state(plan, state.field.occupancy.trimmed(), stage=1)
             return replace(found, step=state.step, cursor=state.cursor)
+        if plan.refine_poses and self.movable and into_stage == 0 and stage in POSES_AT:
+            state = self._with_refined_poses(state)
         wanted = plan.levels(stage)
         if wanted != state.field.layout.resolutions:
-            state = _grown(state, wanted, self.num_images)
+            state = grown(state, wanted, self.num_images)
         return state
+
+    def _with_refined_poses(self, state: FastState) -> FastState:
+        gains = gains_of(state.exposure).astype(np.float64).reshape(-1, 3)
+        render_rays = in_world(self.renderer(state), self.frame)
+        moved = refined(self.movable, state.moved, render_rays, gains, self.frame.background)
+        turned_deg = np.rad2deg(np.linalg.norm(moved[:, :3], axis=1))
+        logger.info("poses refined: turned by %.4f deg in the median", np.median(turned_deg))
+        return replace(state, moved=moved, rays=self._rays_from(moved))
+
+    def _rays_from(self, moved: Float[np.ndarray, "v 6"]) -> RayTable:
+        """The table of rays with the photos at refined poses; where it was made counts for which pixels are in it."""
+        if not self.movable or not moved.any():
+            return self.rays
+        images = moved_images([photo.image for photo in self.movable], moved)
+        rotations, centers = poses_in_frame(images, self.frame)
+        return self.rays._replace(rotations=rotations, centers=centers)
 
     def _pruned(self, field: FastField, density: float) -> FastField:
         """The field without the cells that are nowhere denser than `density`."""
@@ -269,6 +275,7 @@ class FastTraining:
             "step": np.array(state.step, dtype=np.int64),
             "cursor": np.array(state.cursor, dtype=np.int64),
             "chunk_rays": state.chunk_rays,
+            "moved": state.moved,
             "velocity": compress(state.field, state.velocity, reachable),
             "plan": np.frombuffer(plan.to_json().encode(), dtype=np.uint8).copy(),
         }
@@ -292,8 +299,11 @@ class FastTraining:
             step, cursor = int(tensors["step"]), int(tensors["cursor"])
             rays = tensors["chunk_rays"].copy()
             exposure = Exposure(*(tensors[f"exposure_{name}"].copy() for name in Exposure._fields))
-            room = self._workspace(field, plan)
-            return FastState(plan, step, cursor, rays, field, velocity, mean, square, exposure, room)
+            moved = tensors["moved"].copy()
+            return FastState(
+                plan, step, cursor, rays, field, velocity, mean, square, exposure, moved, self._rays_from(moved),
+                self._workspace(field, plan),
+            )  # fmt: skip
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"this checkpoint cannot be resumed ({error}); delete it and train again") from error
 
@@ -313,6 +323,7 @@ def fast_training(
     points_in_world: Float[np.ndarray, "p 3"] | None = None,
     seen: Mapping[str, SeenPoints] | None = None,
     bounded: bool = True,
+    refine_poses: bool = False,
 ) -> FastTraining:
     """The training of a fast field on posed photos.
 
@@ -325,6 +336,7 @@ def fast_training(
         seen: What each photo is known to see.
         bounded: Nothing lies beyond the box.
         use_alpha: False takes photos with alpha as photos on the background of the frame.
+        refine_poses: Keep what a plan with `refine_poses` needs.
 
     Raises:
         InputError: No ray meets the scene.
@@ -356,9 +368,11 @@ def fast_training(
     table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
     known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
     places = places_in_box(frame.normalized_from_world.apply(points), projection, unbounded=unbounded)
+    movable = movable_photos(images, frame, seen) if refine_poses else ()
     return FastTraining(
-        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, places, alpha_known
-    )
+        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, places, alpha_known,
+        movable,
+    )  # fmt: skip
 
 
 def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
@@ -366,21 +380,3 @@ def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
     world = frame.normalized_from_world
     R = cam_from_world.R @ world.R.T
     return Rigid3(R, -R @ world.apply(cam_from_world.target_origin_in_source()))
-
-
-def _next_rays(rays: Int[np.ndarray, "c"], samples: Int[np.ndarray, "c"], room: int) -> Int[np.ndarray, "c"]:
-    """Rays that would fill the room if they had as many samples as the last ones, and a quarter more."""
-    return np.clip((1.25 * rays * room / np.maximum(samples, 1)).astype(np.int64), room // 64, room)
-
-
-def _grown(state: FastState, resolutions: tuple[int, ...], num_images: int) -> FastState:
-    """The same field on more levels: old levels keep their values, new ones start at 0."""
-    old = state.field.layout
-    new = grid_layout(old.extent, resolutions)
-    table, velocity = np.zeros((2, new.num_values), dtype=np.float32)
-    for level, resolution in enumerate(old.resolutions):
-        target = new.resolutions.index(resolution)
-        new.level(table, target)[:] = old.level(state.field.table, level)
-        new.level(velocity, target)[:] = old.level(state.velocity, level)
-    field = replace(state.field, layout=new, table=table)
-    return replace(state, field=field, velocity=velocity, workspace=workspace(field, state.plan, num_images))

@@ -85,6 +85,7 @@ def train_fast_run(
     photos: Path | None = None,
     masks: Path | None = None,
     size_px: int = MAX_SIZE_PX,
+    refine_poses: bool = False,
     on_step: OnStep = lambda point: None,
     on_stage: Callable[[str], None] = lambda stage: None,
 ) -> dict[str, Any]:
@@ -103,6 +104,7 @@ def train_fast_run(
         masks: Folder with masks of the photos; nothing is learned where they are black, nor measured. None: those of
             the reconstruction, if it had some.
         size_px: Photos are reduced to this length of their longer side.
+        refine_poses: Move the training photos so that the field fits them, held by known points. Held-out photos stay.
 
     Returns:
         What `metrics.json` holds.
@@ -122,7 +124,7 @@ def train_fast_run(
         given_photos = with_masks(open_field_input(source, photos), masks, source)
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
-        training = _open(dataset, given, budget_s, use_alpha, seed, executor, memory_gib)
+        training = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
         resumed = (out / CHECKPOINT).exists()
         if given is None and not resumed:
             spent = time.perf_counter() - started
@@ -259,6 +261,7 @@ def _open(
     given: FastPlan | None,
     budget_s: float,
     use_alpha: bool,
+    refine_poses: bool,
     seed: int,
     executor: Executor,
     memory_gib: float = 4.0,
@@ -275,6 +278,7 @@ def _open(
         points_in_world=dataset.points_in_world,
         seen=dataset.seen,
         bounded=dataset.bounded,
+        refine_poses=given.refine_poses if given is not None else refine_poses,
     )
     if given is not None:
         return training
@@ -289,9 +293,8 @@ def _open(
     if training.unbounded:
         finest = min(2 * finest, MAX_UNBOUNDED)
     finest = min(finest, _finest_in_memory(training, memory_gib))
-    return replace(
-        training, plan=first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
-    )
+    plan = first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
+    return replace(training, plan=replace(plan, refine_poses=refine_poses))
 
 
 def _finest_in_memory(training: FastTraining, memory_gib: float) -> int:

@@ -1,0 +1,146 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fast_scenes import FRAME, ball_images
+from fieldstone.field.fast_plan import FastPlan
+from fieldstone.field.fast_training import fast_training
+from fieldstone.field.pose_refinement import MovablePhoto, movable_photos, moved_images, pixels_by_pose, refined
+from fieldstone.field.radiance_field import RenderedRays
+from fieldstone.field.ray_dataset import PosedImage, SeenPoints
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.render.camera_paths import look_at
+from fieldstone.scene.rays import rays_from_view
+
+CAMERA = Camera("SIMPLE_RADIAL", 96, 80, np.array([110.0, 48.0, 40.0, 0.02]))
+WHITE = np.ones(3)
+FREE, TIED = 1e-9 * np.eye(6), 1e12 * np.eye(6)
+
+
+def textured_ball(rays):
+    """An opaque ball of radius 1 at the origin with waves of colour on it."""
+    b = np.sum(rays.origins * rays.directions, axis=1)
+    discriminant = b**2 - np.sum(rays.origins**2, axis=1) + 1
+    t = -b - np.sqrt(np.maximum(discriminant, 0))
+    hit = discriminant > 0
+    normals = rays.origins + t[:, None] * rays.directions
+    waves = 0.5 + 0.3 * np.sin(7.0 * normals[:, [1, 2, 0]]) * np.cos(5.0 * normals)
+    rgb = np.where(hit[:, None], waves, 1.0)
+    return RenderedRays(rgb.astype(np.float32), np.where(hit, t, 9.0).astype(np.float32), hit.astype(np.float32))
+
+
+def photo_from(pose: Rigid3) -> np.ndarray:
+    rendered = textured_ball(rays_from_view(CAMERA, pose))
+    return np.rint(255 * rendered.rgb).astype(np.uint8).reshape(CAMERA.height, CAMERA.width, 3)
+
+
+def displaced(n: int, size: float) -> tuple[list[Rigid3], list[PosedImage]]:
+    """True poses, and photos taken there that are said to be elsewhere."""
+    rng = np.random.default_rng(2)
+    true, images = [], []
+    for k in range(n):
+        angle = 2 * np.pi * k / n
+        pose = look_at(np.array([3.5 * np.cos(angle), 3.5 * np.sin(angle), 0.7]), np.zeros(3), np.array([0.0, 0, 1]))
+        true.append(pose)
+        said = pose.retract(size * rng.normal(size=6))
+        images.append(PosedImage(f"{k}", CAMERA, said, photo_from(pose)))
+    return true, images
+
+
+def errors(true: list[Rigid3], images) -> np.ndarray:
+    """Largest displacement of the corners of a cube in pixels, photo by photo."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+    found = [image_from_cam(CAMERA, image.cam_from_world.apply(corners)) for image in images]
+    expected = [image_from_cam(CAMERA, pose.apply(corners)) for pose in true]
+    return np.array([np.linalg.norm(a - b, axis=1).max() for a, b in zip(found, expected, strict=True)])
+
+
+def test_derivatives_are_those_of_central_differences():
+    rng = np.random.default_rng(0)
+    pose = look_at(np.array([3.0, 1.0, 0.5]), np.zeros(3), np.array([0.0, 0, 1]))
+    points = rng.uniform(-0.6, 0.6, size=(20, 3))
+    J = pixels_by_pose(CAMERA, pose, points)
+    for k in range(6):
+        step = 1e-6 * np.eye(6)[k]
+        ahead, behind = (image_from_cam(CAMERA, pose.retract(s).apply(points)) for s in (step, -step))
+        np.testing.assert_allclose(J[:, :, k], (ahead - behind) / 2e-6, rtol=1e-6, atol=1e-5)
+
+
+def test_photos_find_back_to_where_they_were_taken():
+    true, images = displaced(4, 0.02)
+    before = errors(true, images)
+    assert before.min() > 0.9
+    photos = [MovablePhoto(image, FREE) for image in images]
+    moved = np.zeros((4, 6))
+    for _ in range(4):
+        moved = refined(photos, moved, textured_ball, np.ones((4, 3)), WHITE)
+    after = errors(true, moved_images(images, moved))
+    assert after.max() < 0.02
+
+
+def test_a_photo_twice_as_bright_finds_back_with_its_gain():
+    true, images = displaced(2, 0.02)
+    dark = [replace(image, pixels=np.rint(0.5 * image.pixels).astype(np.uint8)) for image in images]
+    photos = [MovablePhoto(image, FREE) for image in dark]
+    moved = np.zeros((2, 6))
+    for _ in range(4):
+        moved = refined(photos, moved, textured_ball, np.full((2, 3), 0.5), WHITE)
+    assert errors(true, moved_images(dark, moved)).max() < 0.05
+
+
+def test_known_points_hold_the_poses():
+    _, images = displaced(2, 0.004)
+    photos = [MovablePhoto(image, TIED) for image in images]
+    moved = refined(photos, np.zeros((2, 6)), textured_ball, np.ones((2, 3)), WHITE)
+    assert np.abs(moved).max() < 1e-7
+
+
+def test_what_holds_a_photo_is_what_its_points_say():
+    _, images = displaced(2, 0.0)
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, size=(50, 3))
+    seen = {"0": SeenPoints(points, np.full(50, 0.1))}
+    held, by_cube = movable_photos(tuple(images), FRAME, seen)
+    # Half a pixel for each of 50 points: a motion that moves them by one pixel each costs 50 * 4 / 2.
+    J = pixels_by_pose(CAMERA, images[0].cam_from_world, points).reshape(100, 6)
+    np.testing.assert_allclose(held.information, 4.0 * J.T @ J, rtol=1e-9)
+    assert np.linalg.eigvalsh(by_cube.information).min() > 0
+
+
+@pytest.mark.parametrize("background", [0.0, 1.0])
+def test_a_field_that_shows_nothing_moves_nothing(background):
+    _, images = displaced(1, 0.004)
+
+    def nothing(rays):
+        n = len(rays)
+        return RenderedRays(np.full((n, 3), background, np.float32), np.ones(n, np.float32), np.zeros(n, np.float32))
+
+    moved = refined([MovablePhoto(images[0], FREE)], np.zeros((1, 6)), nothing, np.ones((1, 3)), WHITE)
+    np.testing.assert_array_equal(moved, 0.0)
+
+
+def test_training_moves_photos_and_goes_on_from_a_checkpoint_to_the_same_bytes():
+    images = ball_images()
+    off = images[2].cam_from_world.retract(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.02]))
+    images = (*images[:2], replace(images[2], cam_from_world=off), *images[3:])
+    plan = FastPlan(
+        finest=24, steps=(10, 15, 15, 15, 10, 5, 5, 5), num_chunks=2, samples_per_chunk=512, refine_poses=True
+    )
+    with ThreadPoolExecutor(2) as executor:
+        training = fast_training(images, FRAME, plan, seed=3, executor=executor, refine_poses=True)
+        state, stopped = training.start(), None
+        for step in range(plan.total_steps):
+            if step == 45:
+                stopped = {name: array.copy() for name, array in training.to_tensors(state).items()}
+            state, _ = training.step(state)
+        assert stopped is not None
+        again = training.from_tensors(stopped)
+        for _ in range(45, plan.total_steps):
+            again, _ = training.step(again)
+        assert np.abs(state.moved).max() > 0.0
+        assert not np.array_equal(state.rays.centers, training.rays.centers)
+        one, other = training.to_tensors(state), training.to_tensors(again)
+        for name, value in one.items():
+            np.testing.assert_array_equal(value, other[name], err_msg=name)
