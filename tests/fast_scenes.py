@@ -25,15 +25,20 @@ def ball_images(n=8, camera=CAMERA, heights=(0.3, 1.6, -1.2)):
     for k in range(n):
         angle = 2 * np.pi * k / n
         eye = np.array([3.2 * np.cos(angle), 3.2 * np.sin(angle), heights[k % len(heights)]])
-        pose = look_at(eye, np.zeros(3), np.array([0.0, 0, 1]))
-        rays = rays_from_view(camera, pose)
-        b = np.sum(rays.origins * rays.directions, axis=1)
-        discriminant = b**2 - np.sum(rays.origins**2, axis=1) + RADIUS**2
-        normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
-        rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
-        pixels = np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
-        images.append(PosedImage(f"r_{k}", camera, pose, pixels))
+        images.append(ball_image(f"r_{k}", camera, eye))
     return tuple(images)
+
+
+def ball_image(name, camera, eye):
+    """The photo of the ball from a place."""
+    pose = look_at(eye, np.zeros(3), np.array([0.0, 0, 1]))
+    rays = rays_from_view(camera, pose)
+    b = np.sum(rays.origins * rays.directions, axis=1)
+    discriminant = b**2 - np.sum(rays.origins**2, axis=1) + RADIUS**2
+    normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
+    rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
+    pixels = np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
+    return PosedImage(name, camera, pose, pixels)
 
 
 def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):

@@ -44,6 +44,7 @@ def test_train_then_render(blender_folder, tmp_path, capsys):
         (["train", "{in}", "-o", "{out}", "--budget", "soon"], "--budget soon"),
         (["train", "{in}/train", "-o", "{out}"], "no posed photos"),
         (["train", "{in}", "-o", "{out}", "--field", "tiny", "--device", "abacus"], "--device cpu"),
+        (["train", "{in}", "-o", "{out}", "--device", "abacus"], "--device cpu"),
         (["render", "{in}"], "fieldstone train"),
     ],
 )

@@ -1,4 +1,5 @@
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -101,3 +102,33 @@ def test_mistakes_are_named(ball_folder, tmp_path, arguments, message):
 def test_the_other_fields_know_no_plan(ball_folder, tmp_path, capsys):
     assert main(["train", str(ball_folder), "-o", str(tmp_path / "out"), "--field", "tiny", "--no-alpha"]) == 3
     assert "--no-alpha" in capsys.readouterr().err
+
+
+def test_a_run_may_change_its_device(ball_folder, tmp_path, caplog):
+    """torch's own CPU stands for a GPU here; where it left off, the kernels go on."""
+    pytest.importorskip("torch")
+    plan, out = write_plan(tmp_path / "plan.json", steps=12), tmp_path / "out"
+    first = train_fast_run(ball_folder, out, plan=plan, device="cpu:0", threads=1, max_steps=60)
+    assert "never on a GPU" in caplog.text
+    assert first["device"] == "cpu:0"
+    last = train_fast_run(ball_folder, out, plan=plan, threads=1)
+    assert last["device"] == "cpu"
+    assert last["steps"] == 96
+    assert last["psnr"] > first["psnr"]
+    assert len(json.loads((out / "curve.json").read_text())) == 96
+
+
+def test_a_budget_becomes_a_plan_on_every_device(ball_folder, tmp_path):
+    pytest.importorskip("torch")
+    metrics = train_fast_run(ball_folder, tmp_path / "out", budget_s=2.0, device="cpu:0", threads=1)
+    plan = metrics["plan"]
+    assert metrics["steps"] == min(sum(plan["steps"]), plan["stop_after"] or sum(plan["steps"])) > 8
+
+
+def test_a_device_without_torch_says_what_to_install(ball_folder, tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("fieldstone.field.torch_")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match=r"fast field on cuda needs torch: pip install 'fieldstone\[torch\]'"):
+        train_fast_run(ball_folder, tmp_path / "out", budget_s=1.0, device="cuda", threads=1)
+    assert not (tmp_path / "out").exists()

@@ -21,6 +21,15 @@ STAGE_SHARES = (0.08, 0.12, 0.2, 0.2, 0.18, 0.12, 0.06, 0.04)
 STAGE_HALVINGS = (2, 1, 0, 0, 0, 0, 0, 0)
 """How often the finest resolution is halved in each stage."""
 
+PRUNE_AT = (0.25, 0.6)
+"""Shares of a stage after which empty cells are given up; also when a stage begins."""
+
+LAST_PRUNED = 4
+"""Stages after this one give up cells when they begin, and not again: there is hardly anything left to give up."""
+
+MIN_STEPS = 60
+"""No cell is given up before so many steps."""
+
 COARSEST_LEVEL = 14
 """Levels go down to about this many cells along the longest side."""
 
@@ -96,6 +105,19 @@ class FastPlan:
     def stage_of(self, step: int) -> int:
         """The stage that step number `step` (from 0) belongs to."""
         return min(int(np.searchsorted(np.cumsum(self.steps), step, side="right")), len(self.steps) - 1)
+
+    def place(self, step: int) -> tuple[int, int]:
+        """The stage of step number `step`, and how many steps of this stage come before it."""
+        stage = self.stage_of(step)
+        return stage, step - sum(self.steps[:stage])
+
+    def prunes_at(self, step: int) -> bool:
+        """Whether empty cells are given up before step number `step`."""
+        stage, into_stage = self.place(step)
+        prune = into_stage == 0 and stage > 0
+        if stage <= LAST_PRUNED:
+            prune |= any(into_stage == int(share * self.steps[stage]) > 0 for share in PRUNE_AT)
+        return prune and step >= MIN_STEPS
 
     def levels(self, stage: int) -> tuple[int, ...]:
         """Resolutions of the levels that a stage has, coarse to fine."""

@@ -40,6 +40,10 @@ class FastState:
     workspace: Workspace
     """Room for the next step; follows from the rest."""
 
+    def with_plan(self, plan: FastPlan) -> FastState:
+        """The same state, with other steps to come."""
+        return replace(self, plan=plan)
+
 
 def next_rays(rays: Int[np.ndarray, "c"], samples: Int[np.ndarray, "c"], room: int) -> Int[np.ndarray, "c"]:
     """Rays that would fill the room if they had as many samples as the last ones, and a quarter more."""

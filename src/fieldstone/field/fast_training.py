@@ -53,26 +53,17 @@ logger = logging.getLogger(__name__)
 CELL_VERTICES = 2
 """An occupancy cell is this many cells of the finest level wide."""
 
-PRUNE_AT = (0.25, 0.6)
-"""Shares of a stage after which empty cells are given up; also when a stage begins."""
-
 SOLID = 0.1
 """A cell is solid where a step takes this optical depth."""
 
 POSES_AT = (2, 3, 4, 5, 6)
 """Stages that begin with refined poses, if the plan has them: what coarse grids show is too blurred to tell."""
 
-LAST_PRUNED = 4
-"""Stages after this one give up cells when they begin, and not again: there is hardly anything left to give up."""
-
 START_WEIGHTS = 1.2
 """The fog of the start weighs at least this many times `FastPlan.min_weight` in every sample."""
 
 FOG = 1.2
 """Cells with less than this many times the density of the start are what no ray has asked for."""
-
-MIN_STEPS = 60
-"""No cell is given up before so many steps."""
 
 NEAR_SHARE = 0.5
 """In an unbounded scene, rays begin at this share of the nearest distance of the frame."""
@@ -144,7 +135,7 @@ class FastTraining:
 
     def step(self, state: FastState, /) -> tuple[FastState, StepReport]:
         """One step; grids and occupancy change at the steps that the plan says."""
-        state = self._scheduled(state)
+        state = self.scheduled(state)
         plan = state.plan
         share = plan.rate_share(state.step)
         starts = state.cursor + np.concatenate([[0], np.cumsum(state.chunk_rays)])
@@ -160,7 +151,7 @@ class FastTraining:
         rays = np.array([rays for rays, _, _, _ in found], dtype=np.int64)
         loss = sum(squared for _, _, _, squared in found)
         mse = loss / (3.0 * max(int(rays.sum()), 1))
-        rays = np.maximum(rays - self._num_known(state), 1)
+        rays = np.maximum(rays - self.num_known(state), 1)
         state = replace(
             state,
             step=state.step + 1,
@@ -169,7 +160,7 @@ class FastTraining:
         )
         return state, StepReport(loss=mse, mse=mse)
 
-    def _num_known(self, state: FastState) -> Int[np.ndarray, "c"]:
+    def num_known(self, state: FastState) -> Int[np.ndarray, "c"]:
         """Rays to known points that each chunk draws."""
         use = state.plan.point_weight > 0 and len(self.known.image) > 0
         return state.chunk_rays // RAYS_PER_KNOWN * int(use)
@@ -181,7 +172,7 @@ class FastTraining:
         gains = gains_of(state.exposure)
         emptiness = 0.0 if self.alpha_known else plan.emptiness
         terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(plan.point_weight * share))
-        num_known = self._num_known(state)
+        num_known = self.num_known(state)
 
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
@@ -193,15 +184,18 @@ class FastTraining:
 
         return list(self.executor.map(chunk, range(len(room.chunks))))
 
-    def _scheduled(self, state: FastState) -> FastState:
+    def is_due(self, state: FastState) -> bool:
+        """Whether grids or occupancy change before the next step, see `scheduled`."""
+        stage, into_stage = state.plan.place(state.step)
+        again = state.plan.scout and stage == 1 and into_stage == 0
+        grows = state.plan.levels(stage) != state.field.layout.resolutions
+        return again or grows or state.plan.prunes_at(state.step) or self._moves_photos(state)
+
+    def scheduled(self, state: FastState) -> FastState:
         """Grow the grid at the first step of a stage, and give up empty cells when it is time."""
         plan = state.plan
-        stage = plan.stage_of(state.step)
-        into_stage = state.step - sum(plan.steps[:stage])
-        prune = into_stage == 0 and stage > 0
-        if stage <= LAST_PRUNED:
-            prune |= any(into_stage == int(share * plan.steps[stage]) > 0 for share in PRUNE_AT)
-        if prune and state.step >= MIN_STEPS:
+        stage, into_stage = plan.place(state.step)
+        if plan.prunes_at(state.step):
             fog = FOG * math.exp(state.field.raw_offset) if stage >= plan.clear_fog_from else 0.0
             field = self._pruned(state.field, max(plan.prune_density, fog))
             if plan.clear_floaters_from <= stage and into_stage == 0 and len(self.places):
@@ -210,12 +204,16 @@ class FastTraining:
         if plan.scout and stage == 1 and into_stage == 0:
             found = self._first_state(plan, state.field.occupancy.trimmed(), stage=1)
             return replace(found, step=state.step, cursor=state.cursor)
-        if plan.refine_poses and self.movable and into_stage == 0 and stage in POSES_AT:
+        if self._moves_photos(state):
             state = self._with_refined_poses(state)
         wanted = plan.levels(stage)
         if wanted != state.field.layout.resolutions:
             state = grown(state, wanted, self.num_images)
         return state
+
+    def _moves_photos(self, state: FastState) -> bool:
+        stage, into_stage = state.plan.place(state.step)
+        return state.plan.refine_poses and bool(self.movable) and into_stage == 0 and stage in POSES_AT
 
     def _with_refined_poses(self, state: FastState) -> FastState:
         gains = gains_of(state.exposure).astype(np.float64).reshape(-1, 3)

@@ -64,13 +64,21 @@ def _chunk(samples: Samples, n: int, room: int, width: int, decoder: Decoder, nu
         part(samples.light, 1), part(samples.ray, 1), part(samples.features, width),
     )  # fmt: skip
     most = room + room // RAYS_PER_KNOWN
-    rays = RayBatch(
-        floats(3 * most), floats(3 * most), floats(3 * most), floats(3 * most), floats(3 * most),
-        np.zeros(most, dtype=np.int32), floats(3 * most), np.zeros(most, dtype=np.int64), floats(most),
-        np.zeros(most + 1, dtype=np.int64), floats(most),
-    )  # fmt: skip
+    rays = room_for_rays(most)
     work = Work(
         floats(most * HIDDEN), floats(most * HIDDEN), floats(room * HIDDEN), floats(3 * room), floats(3 * room),
         floats(room), floats(room), floats(3 * most),
     )  # fmt: skip
     return Chunk(rays, own, work, Decoder(*(np.zeros_like(weights) for weights in decoder)), floats(3 * num_images))
+
+
+def room_for_rays(count: int) -> RayBatch:
+    """Empty arrays for so many rays."""
+
+    def floats(size: int) -> np.ndarray:
+        return np.zeros(size * count, dtype=np.float32)
+
+    return RayBatch(
+        floats(3), floats(3), floats(3), floats(3), floats(3), np.zeros(count, dtype=np.int32), floats(3),
+        np.zeros(count, dtype=np.int64), floats(1), np.zeros(count + 1, dtype=np.int64), floats(1),
+    )  # fmt: skip

@@ -1,7 +1,8 @@
 """The fast field in torch: the same parameters, with gradients by autograd.
 
-It is the oracle for the hand-written gradients, and runs on any torch device. Samples are packed: sample i belongs to
-ray `ray[i]`, and the samples of a ray lie in order.
+`TorchFastField` is the oracle for the hand-written gradients; what follows the interpolation also trains the field on
+other devices than the CPU, see `torch_fast_training`. Samples are packed: sample i belongs to ray `ray[i]`, and the
+samples of a ray lie in order.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch import Tensor
 from fieldstone.field.fast_decoder import DIRECTIONS, HIDDEN, Decoder
 from fieldstone.field.fast_field import FastField
 from fieldstone.field.fast_grid import CHANNELS
+from fieldstone.field.fast_march_numba import MAX_RAW
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +59,56 @@ def interpolate(field: TorchFastField, points: Float[Tensor, "n 3"]) -> Float[Te
 
 
 def decode(
-    field: TorchFastField, values: Float[Tensor, "n l c"], directions: Float[Tensor, "n 3"]
+    decoder: dict[str, Tensor], values: Float[Tensor, "n l c"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """As `fast_decoder.decode`."""
-    decoder = field.decoder
     x, y, z = directions.unbind(dim=1)
     basis = torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0], dim=1)
     weights = decoder["feature_weights"].reshape(-1, CHANNELS, HIDDEN)[: values.shape[1], 1:]
     hidden = torch.einsum("nlc,lch->nh", values[:, :, 1:], weights)
     hidden = hidden + basis @ decoder["direction_weights"].reshape(DIRECTIONS, HIDDEN) + decoder["hidden_bias"]
     return torch.sigmoid(hidden.relu() @ decoder["color_weights"].reshape(3, HIDDEN).T + decoder["color_bias"])
+
+
+def optical_depths_of(values: Float[Tensor, "n l c"], raw_offset: float, depth_scale: float) -> Float[Tensor, "n"]:
+    """Optical depth of each sample from its interpolated values.
+
+    Above `MAX_RAW` a sample is as dense as it gets; its gradient is that of what it has, not 0: it can get thinner.
+
+    Args:
+        depth_scale: Optical depth of a sample at density 1.
+    """
+    raw = values[:, :, 0].sum(dim=1) + raw_offset
+    raw = raw - (raw - float(MAX_RAW)).clamp(min=0.0).detach()
+    return torch.exp(raw) * depth_scale
+
+
+def depths_before(
+    tau: Float[Tensor, "n"], ray: Int[Tensor, "n"], num_rays: int
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "r"]]:
+    """Optical depth in front of each packed sample, and of whole rays.
+
+    Sums run along each ray on its own: one over all samples would lose the small ones in float32.
+    """
+    count = torch.zeros(num_rays, dtype=ray.dtype, device=ray.device).index_add(0, ray, torch.ones_like(ray))
+    first = torch.cumsum(count, dim=0) - count
+    place = torch.arange(len(ray), device=ray.device) - first[ray]
+    most = int(count.max()) if num_rays else 0
+    # (r, s + 1): a zero leads, so that the sum up to a sample does not hold the sample itself.
+    by_ray = tau.new_zeros((num_rays, most + 1)).index_put((ray, place + 1), tau)
+    sums = torch.cumsum(by_ray, dim=1)
+    return sums[ray, place], sums[:, most]
+
+
+def composite_packed(
+    rgb: Float[Tensor, "n 3"],
+    weights: Float[Tensor, "n"],
+    ray: Int[Tensor, "n"],
+    passed: Float[Tensor, "r"],
+    background: Float[Tensor, "r 3"],
+) -> Float[Tensor, "r 3"]:
+    """Colours of rays from those of their samples, and of the background where light passes."""
+    return (passed[:, None] * background).index_add(0, ray, weights[:, None] * rgb)
 
 
 def packed_colors(
@@ -82,16 +124,17 @@ def packed_colors(
     Args:
         depth_scale: Optical depth of a sample at density 1.
     """
-    weights = packed_weights(field, points, ray, len(directions), depth_scale)
-    colors = decode(field, interpolate(field, points), directions[ray])
-    out = torch.zeros_like(background).index_add(0, ray, weights[:, None] * colors)
-    opacity = torch.zeros_like(background[:, 0]).index_add(0, ray, weights)
-    return out + (1.0 - opacity)[:, None] * background
+    values = interpolate(field, points)
+    tau = optical_depths_of(values, field.raw_offset, depth_scale)
+    before, total = depths_before(tau, ray, len(directions))
+    weights = torch.exp(-before) * -torch.expm1(-tau)
+    rgb = decode(field.decoder, values, directions[ray])
+    return composite_packed(rgb, weights, ray, torch.exp(-total), background)
 
 
 def optical_depths(field: TorchFastField, points: Float[Tensor, "n 3"], depth_scale: float) -> Float[Tensor, "n"]:
     """Optical depth of each sample; arguments as of `packed_colors`."""
-    return torch.exp(interpolate(field, points)[:, :, 0].sum(dim=1) + field.raw_offset) * depth_scale
+    return optical_depths_of(interpolate(field, points), field.raw_offset, depth_scale)
 
 
 def packed_weights(
@@ -99,8 +142,5 @@ def packed_weights(
 ) -> Float[Tensor, "n"]:
     """Share of the light of its ray that ends in each packed sample; arguments as of `packed_colors`."""
     tau = optical_depths(field, points, depth_scale)
-    before = torch.cumsum(tau, dim=0) - tau
-    # The sum before the first sample of each ray is taken off, so that every ray starts anew.
-    starts = torch.searchsorted(ray, torch.arange(num_rays, device=ray.device, dtype=ray.dtype))
-    offset = torch.where(starts < len(ray), before[starts.clamp(max=len(ray) - 1)], before.new_zeros(()))
-    return torch.exp(offset[ray] - before) * -torch.expm1(-tau)
+    before, _ = depths_before(tau, ray, num_rays)
+    return torch.exp(-before) * -torch.expm1(-tau)

@@ -13,14 +13,14 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
-from fieldstone.field.fast_exposure import gain_at
+from fieldstone.field.fast_exposure import Exposure, gain_at
 from fieldstone.field.fast_plan import (
     STAGE_SHARES,
     FastPlan,
@@ -30,8 +30,8 @@ from fieldstone.field.fast_plan import (
     plan_for_budget,
     plan_from_json,
 )  # fmt: skip
-from fieldstone.field.fast_training import FastState, FastTraining, fast_training
-from fieldstone.field.radiance_field import FieldFrame, in_world
+from fieldstone.field.fast_training import FastTraining, fast_training
+from fieldstone.field.radiance_field import FieldFrame, FieldTraining, in_world
 from fieldstone.field.ray_dataset import PosedImage, RayDataset, reduce_image
 from fieldstone.field.training import CurvePoint, OnStep, train
 from fieldstone.geometry.camera import Camera
@@ -50,6 +50,7 @@ from fieldstone.pipeline.fields import (
     resume_or_start,
     run_header,
     scene_tensors,
+    torch_for,
     write_field_report,
 )
 from fieldstone.render.views import render_view
@@ -71,6 +72,37 @@ TIME_KEPT = 0.97
 """Share of the budget that is planned for: the last steps and the last checkpoint take what they take."""
 
 
+P = TypeVar("P", bound="PlannedState")
+
+
+@runtime_checkable
+class PlannedState(Protocol):
+    """A state of a training that follows a plan, on whatever device."""
+
+    @property
+    def plan(self) -> FastPlan:
+        """What is followed."""
+        ...
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        ...
+
+    @property
+    def exposure(self) -> Exposure:
+        """Of every photo."""
+        ...
+
+    def with_plan(self: P, plan: FastPlan) -> P:
+        """The same state, with other steps to come."""
+        ...
+
+
+StepsBy = Callable[[FastTraining], FieldTraining[Any]]
+"""Who does the steps of a training."""
+
+
 def train_fast_run(
     source: Path,
     out: Path,
@@ -86,6 +118,7 @@ def train_fast_run(
     masks: Path | None = None,
     size_px: int = MAX_SIZE_PX,
     refine_poses: bool = False,
+    device: str = "cpu",
     on_step: OnStep = lambda point: None,
     on_stage: Callable[[str], None] = lambda stage: None,
 ) -> dict[str, Any]:
@@ -105,41 +138,44 @@ def train_fast_run(
             the reconstruction, if it had some.
         size_px: Photos are reduced to this length of their longer side.
         refine_poses: Move the training photos so that the field fits them, held by known points. Held-out photos stay.
+        device: Where steps are computed: cpu, or a device of torch, see `torch_fast_training`. Equal plans then give
+            equal fields to rounding only. Rendering stays on the CPU.
 
     Returns:
         What `metrics.json` holds.
 
     Raises:
-        InputError: The source or the plan cannot be used, or `out` holds another field.
+        InputError: The source, the plan or the device cannot be used, or `out` holds another field.
     """
     if not budget_s > 0:
         raise InputError(f"a budget must be positive, got {budget_s:g} s; say for example --budget 60s")
     threads = threads or os.cpu_count() or 1
     given = None if plan is None else _read_plan(plan)
+    steps_by = steps_on(device)
     with ThreadPoolExecutor(threads) as executor:
         on_stage("compiling")
-        compile_kernels(executor)
+        compile_kernels(executor, steps_by)
         started = time.perf_counter()
         on_stage("reading photos")
         given_photos = with_masks(open_field_input(source, photos), masks, source)
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
-        training = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
+        opened = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
         resumed = (out / CHECKPOINT).exists()
         if given is None and not resumed:
             spent = time.perf_counter() - started
-            seconds_per_step = measured_step(training)
-            found = plan_for_budget(training.plan, TIME_KEPT * budget_s, spent, seconds_per_step)
-            training = replace(training, plan=found)
+            seconds_per_step = measured_step(steps_by(opened))
+            opened = replace(opened, plan=plan_for_budget(opened.plan, TIME_KEPT * budget_s, spent, seconds_per_step))
+        training = steps_by(opened)
         state, curve = resume_or_start(training, out, header)
         views = scene_tensors(dataset.train)
 
-        def save(state: FastState, curve: tuple[CurvePoint, ...]) -> None:
+        def save(state: PlannedState, curve: tuple[CurvePoint, ...]) -> None:
             write_json(out / CURVE, [asdict(point) for point in curve])
             write_text(out / PLAN, state.plan.to_json() + "\n")
             write_checkpoint(out / CHECKPOINT, {**views, **prefixed(training.to_tensors(state))}, header)
 
-        def preview(state: FastState) -> None:
+        def preview(state: PlannedState) -> None:
             image = reduce_image(dataset.train[0], PREVIEW_SIZE_PX)
             view = render_view(in_world(training.renderer(state), dataset.frame), image.camera, image.cam_from_world)
             write_photo(out / PREVIEW, quantize(view.rgb))
@@ -160,7 +196,7 @@ def train_fast_run(
         "field": "fast",
         "alpha": use_alpha,
         "plan": asdict(state.plan),
-        "device": "cpu",
+        "device": device,
         "threads": threads,
         "seed": seed,
         "version": __version__,
@@ -170,7 +206,23 @@ def train_fast_run(
     return metrics
 
 
-def exposure_near(dataset: RayDataset, state: FastState) -> Callable[[PosedImage], np.ndarray] | None:
+def steps_on(device: str) -> StepsBy:
+    """The steps of a training as they are on the CPU, and by torch on other devices.
+
+    Raises:
+        InputError: torch is not installed, or the device is not there.
+    """
+    if device == "cpu":
+        return lambda training: training
+    with torch_for(f"the fast field on {device}"):
+        from fieldstone.field.torch_fast_training import TorchFastTraining
+        from fieldstone.field.torch_training import torch_device
+    found = torch_device(device)
+    logger.warning("training on %s: this way was tested on torch's CPU device only, never on a GPU", device)
+    return lambda training: TorchFastTraining(training, found)
+
+
+def exposure_near(dataset: RayDataset, state: PlannedState) -> Callable[[PosedImage], np.ndarray] | None:
     """The exposure that a held-out view is shown with, from the training photos near it; None: none was learned."""
     if state.plan.exposure_rate == 0:
         return None
@@ -180,16 +232,16 @@ def exposure_near(dataset: RayDataset, state: FastState) -> Callable[[PosedImage
 
 
 def train_stages(
-    training: FastTraining,
-    state: FastState,
+    training: FieldTraining[P],
+    state: P,
     curve: tuple[CurvePoint, ...],
     *,
     deadline: float | None,
     max_steps: int | None,
     on_step: OnStep,
-    save: Callable[[FastState, tuple[CurvePoint, ...]], None],
-    preview: Callable[[FastState], None] = lambda state: None,
-) -> tuple[FastState, tuple[CurvePoint, ...]]:
+    save: Callable[[P, tuple[CurvePoint, ...]], None],
+    preview: Callable[[P], None] = lambda state: None,
+) -> tuple[P, tuple[CurvePoint, ...]]:
     """Follow the plan of a state to its end, stage by stage.
 
     Args:
@@ -210,12 +262,12 @@ def train_stages(
         preview(state)
         now = time.perf_counter()
         if state.step < last:
-            state = replace(state, plan=replace(state.plan, stop_after=state.step))
+            state = state.with_plan(replace(state.plan, stop_after=state.step))
             logger.warning("the time is over after %d of %d steps", state.step, sum(plan.steps))
         elif deadline is not None and stage + 1 < len(plan.steps) and last == end:
             slower = 1.4 if plan.levels(stage + 1) != plan.levels(stage) else 1.0
             per_step = slower * (now - began) / (state.step - before)
-            state = replace(state, plan=corrected(plan, stage + 1, deadline - now, per_step))
+            state = state.with_plan(corrected(plan, stage + 1, deadline - now, per_step))
             logger.info(
                 "stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, now - began, state.plan.steps
             )
@@ -223,7 +275,7 @@ def train_stages(
     return state, curve
 
 
-def measured_step(training: FastTraining) -> float:
+def measured_step(training: FieldTraining[Any]) -> float:
     """Seconds of a first step on this machine, by trying some."""
     state = training.start()
     times = []
@@ -234,7 +286,7 @@ def measured_step(training: FastTraining) -> float:
     return float(np.median(times[2:]))
 
 
-def compile_kernels(executor: Executor) -> None:
+def compile_kernels(executor: Executor, steps_by: StepsBy = lambda training: training) -> None:
     """Run every kernel once, so that what follows measures the machine and not the compiler."""
     camera = Camera("SIMPLE_PINHOLE", 12, 12, np.array([14.0, 6.0, 6.0]))
     pixels = np.full((12, 12, 4), 255, dtype=np.uint8)
@@ -242,7 +294,7 @@ def compile_kernels(executor: Executor) -> None:
     image = PosedImage("compile", camera, Rigid3(np.eye(3), np.array([0.0, 0, 4])), pixels)
     frame = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
     plan = FastPlan(finest=64, steps=(1,) * len(STAGE_SHARES), num_chunks=1, samples_per_chunk=256)
-    training = fast_training((image,), frame, plan, seed=0, executor=executor)
+    training = steps_by(fast_training((image,), frame, plan, seed=0, executor=executor))
     state = training.start()
     for _ in range(plan.total_steps):
         state, _ = training.step(state)

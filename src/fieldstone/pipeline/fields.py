@@ -116,6 +116,24 @@ def train_run(
 
 
 @contextmanager
+def torch_for(what: str) -> Iterator[None]:
+    """Imports within need torch.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise InputError(
+            f"{what} needs torch: pip install 'fieldstone[torch]' "
+            "(without a GPU, from the index https://download.pytorch.org/whl/cpu)"
+        ) from error
+
+
+@contextmanager
 def open_training(
     options: TrainOptions, frame: FieldFrame, dataset: RayDataset | None, *, seed: int, device: str, threads: int
 ) -> Iterator[FieldTraining[Any]]:
@@ -124,15 +142,8 @@ def open_training(
     Raises:
         InputError: torch is not installed, or the device is not there.
     """
-    try:
+    with torch_for(f"the {options.network} network"):
         from fieldstone.field.torch_training import TorchTraining, torch_device, torch_workers
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise InputError(
-            f"the {options.network} network needs torch: pip install 'fieldstone[torch]' "
-            "(without a GPU, from the index https://download.pytorch.org/whl/cpu)"
-        ) from error
     rays = None if dataset is None else training_rays(dataset.train, frame)
     with torch_workers(threads) as workers:
         yield TorchTraining(options, frame, rays, seed, torch_device(device), workers)

@@ -1,0 +1,295 @@
+"""The steps of the fast field in torch, against those of the kernels and against autograd of the dense twin."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fast_scenes import CAMERA, FRAME, RADIUS, ball_image, ball_images, random_field, random_rays
+from fieldstone.evaluate.image_metrics import psnr
+from fieldstone.field.fast_decoder import Decoder
+from fieldstone.field.fast_exposure import Exposure
+from fieldstone.field.fast_field import FOREVER, field_from_tensors, renderer, room_for_samples
+from fieldstone.field.fast_march_numba import march_rays
+from fieldstone.field.fast_plan import FastPlan
+from fieldstone.field.fast_step_numba import GRADIENT_SCALE
+from fieldstone.field.fast_terms_numba import Terms
+from fieldstone.field.fast_training import fast_training
+from fieldstone.field.occupancy import Occupancy
+from fieldstone.field.radiance_field import FieldTraining
+from fieldstone.field.ray_dataset import SeenPoints
+from fieldstone.scene.rays import rays_from_view
+
+torch = pytest.importorskip("torch")
+
+from fieldstone.field.torch_fast_training import TorchFastTraining, TorchRays, step_gradient  # noqa: E402
+from fieldstone.field.torch_field import (  # noqa: E402
+    depths_before,
+    optical_depths,
+    packed_colors,
+    packed_weights,
+    torch_fast_field,
+)
+from fieldstone.field.torch_grid import torch_grid  # noqa: E402
+from fieldstone.field.torch_march import march_packed, torch_box  # noqa: E402
+
+CPU = torch.device("cpu")
+
+# The kernels' own choice for grids as small as these: all levels move batch by batch.
+PLAN = FastPlan(
+    finest=32, steps=(20, 20, 20, 20, 20, 10, 5, 5), num_chunks=4, samples_per_chunk=512, immediate_levels=0
+)
+OPEN = replace(
+    PLAN, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3, exposure_rate=0.03, point_weight=0.1
+)
+
+
+def seen_by(images, points):
+    """What faces each camera of points on the ball."""
+    centers = [image.cam_from_world.target_origin_in_source() for image in images]
+    facing = [points[np.einsum("ni,ni->n", points, c - points) > 0.3] for c in centers]
+    return {image.name: SeenPoints(p, np.full(len(p), 0.01)) for image, p in zip(images, facing, strict=True)}
+
+
+def photographed(scene, executor, plan=None):
+    """The training of a kind of scene, and a photo that it does not have."""
+    images = ball_images(20)
+    if scene in ("alpha", "no alpha"):
+        work = fast_training(images[1:], FRAME, plan or PLAN, seed=0, executor=executor, use_alpha=scene == "alpha")
+        return work, images[0]
+    if scene == "forward":
+        places = [np.array([x, -3.2, z]) for x in (-0.4, 0.0, 0.4) for z in (-0.3, 0.0, 0.3)]
+        images = [ball_image(f"r_{k}", CAMERA, place) for k, place in enumerate(places)]
+    dark = [np.where(image.pixels[..., 3:] > 127, image.pixels[..., :3], 0) for image in images]
+    images = tuple(replace(image, pixels=np.ascontiguousarray(p)) for image, p in zip(images, dark, strict=True))
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
+    work = fast_training(
+        images[1:], replace(FRAME, background=np.zeros(3)), plan or OPEN, seed=0, executor=executor,
+        points_in_world=points, seen=seen_by(images, points), bounded=False,
+    )  # fmt: skip
+    assert work.projection.active == (scene == "forward")
+    return work, images[0]
+
+
+SCENES = ["alpha", "no alpha", "around", "forward"]
+
+
+def run(work, state, steps):
+    reports = []
+    for _ in range(steps):
+        state, report = work.step(state)
+        reports.append(report)
+    return state, reports
+
+
+def copied(tensors):
+    return {name: array.copy() for name, array in tensors.items()}
+
+
+def same_tensors(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].dtype == b[name].dtype
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def close(actual, expected, tolerance=1e-4):
+    return np.linalg.norm(actual - expected) <= tolerance * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("done", [0, 70])
+def test_a_step_is_that_of_the_kernels(scene, done):
+    """From one checkpoint, both make the same step: rays, samples, gradients of all terms, and what they move."""
+    with ThreadPoolExecutor(1) as executor:
+        plan = replace(OPEN if scene in ("around", "forward") else PLAN, num_chunks=1, samples_per_chunk=2048)
+        work, _ = photographed(scene, executor, plan)
+        twin = TorchFastTraining(work, CPU)
+        state, _ = run(work, work.start(), done)
+        before = copied(work.to_tensors(state))
+        state, (report,) = run(work, state, 1)
+        expected = copied(work.to_tensors(state))
+        twin_state, (twin_report,) = run(twin, twin.from_tensors(before), 1)
+        actual = twin.to_tensors(twin_state)
+    assert twin_report.loss == pytest.approx(report.loss, rel=1e-4)
+    assert actual.keys() == expected.keys()
+    # What is new in a moment is the gradient, or its square.
+    memories = {"mean": 0.9, "square": 0.99, "velocity": plan.decay, "exposure_mean": 0.9, "exposure_square": 0.99}
+    for name in actual:
+        if name == "exposure_log_gain" and done == 0:
+            continue  # the first step of Adam is the sign of the gradient, and here some are nothing but rounding
+        memory = next((memories[kind] for kind in memories if name.startswith(kind)), 0.0)
+        of_memory = memory * before[name] if memory else 0
+        np.testing.assert_equal(actual[name].dtype, expected[name].dtype)
+        assert close(actual[name] - of_memory, expected[name] - of_memory), name
+
+
+def test_gradients_match_autograd_of_the_dense_twin():
+    """The rows that a batch touches get the gradient that they have among all vertices; float64."""
+    rng = np.random.default_rng(3)
+    field = random_field(rng)
+    march, terms = field.march(0.0, 0.0), Terms(np.float32(0.7), np.float32(0.3), np.float32(0.4))
+    origins, directions = (torch.tensor(a) for a in random_rays(rng, field, 60))
+    velocity = np.zeros_like(field.table)
+    grid = torch_grid(field.layout, field.table, velocity, CPU)
+    box = torch_box(field.occupancy, field.layout.extent, False, CPU)
+    samples = march_packed(grid, box, march, origins, directions, torch.full((60,), 0.3), 1 << 20)
+    samples = replace(samples, points=samples.points.double(), distance=samples.distance.double())
+    samples = replace(samples, veil=samples.veil.double(), veil_behind=samples.veil_behind.double())
+    window = torch.tensor(np.sort(rng.uniform(2.5, 5.5, (60, 2)), axis=1))
+    window[::2] = -torch.inf
+    target, background = torch.tensor(rng.random((2, 60, 3)))
+    target[::3] = background[::3]
+    image = torch.tensor(rng.integers(0, 4, 60))
+    log_gain = rng.uniform(-0.3, 0.3, 12)
+    rays = TorchRays(
+        origins.double(), directions.double(), directions.double(), target, background, image, torch.zeros(60), window
+    )
+    double = replace(grid, vertices=grid.vertices.double(), per_unit=torch.tensor(1.0 / field.layout.spacings))
+    found = step_gradient(field, double, march, terms, Exposure(log_gain, log_gain, log_gain), rays, samples)
+
+    twin = torch_fast_field(field, torch.float64, CPU)
+    scale, ray = float(march.depth_scale), samples.ray
+    theta = torch.tensor(log_gain.reshape(4, 3), requires_grad=True)
+    colors = packed_colors(twin, samples.points, ray, rays.views, background, scale)
+    weights = packed_weights(twin, samples.points, ray, 60, scale)
+    squared = ((theta.exp()[image] * colors - target) ** 2).sum()
+    before = samples.distance < window[ray, 0]
+    there = (samples.distance <= window[ray, 1]) & ~before
+    bare = (torch.arange(60) % 3 == 0)[ray]
+    depths = optical_depths(twin, samples.points, scale)
+    loss = squared + float(terms.sparsity) * weights.sum() + float(terms.emptiness) * torch.log1p(depths[bare]).sum()
+    loss = loss + float(terms.points) * (weights[before].sum() - weights[there].sum())
+    parameters = [*twin.levels, *(twin.decoder[name] for name in Decoder._fields), theta]
+    expected = [0.5 * float(GRADIENT_SCALE) * g.numpy() for g in torch.autograd.grad(loss, parameters)]
+    assert found.squared_error == pytest.approx(squared.item(), rel=1e-9)
+    table = np.zeros((len(field.table) // 4, 4))
+    table[found.rows.numpy()] = found.vertices.numpy()
+    for level in range(field.layout.num_levels):
+        assert close(field.layout.level(table.reshape(-1), level), expected[level], 1e-9)
+    for actual, of_group in zip([*found.decoder, found.log_gain], expected[field.layout.num_levels :], strict=True):
+        assert close(actual.reshape(-1), of_group.reshape(-1), 1e-9)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("min_weight", [0.0, 2e-2])
+def test_samples_are_those_of_the_kernels(unbounded, min_weight):
+    """Same places, and the same light at each, of which some was taken by samples that are left out."""
+    rng = np.random.default_rng(1)
+    field = replace(random_field(rng, raw_offset=-1.5), unbounded=unbounded, near=0.1)
+    cells = rng.random(field.occupancy.cells.shape) < 0.4
+    field = replace(field, occupancy=Occupancy(field.occupancy.lower, field.occupancy.cell_size, cells))
+    origins, directions = random_rays(rng, field, 200)
+    origins[0], directions[0] = field.occupancy.lower + [0.6, 0.6, -3.0], [0, 0, 1]  # along two faces
+    origins[1], directions[1] = field.occupancy.lower + [-0.1, 0.6, -3.0], [0, 0, 1]  # beside the box
+    jitter = rng.random(200).astype(np.float32)
+    march = field.march(min_weight, 1e-2)
+    kernel, first, passed = room_for_samples(1 << 15, field.width), np.zeros(201, np.int64), np.zeros(200, np.float32)
+    num_rays, n, _ = march_rays(
+        field.layout.arrays(field.table), field.box(), march, origins.reshape(-1), directions.reshape(-1), jitter,
+        FOREVER, 200, field.width, kernel, first, passed,
+    )  # fmt: skip
+    assert num_rays == 200
+    grid = torch_grid(field.layout, field.table, np.zeros_like(field.table), CPU)
+    box = torch_box(field.occupancy, field.layout.extent, unbounded, CPU)
+    rays = (torch.tensor(origins), torch.tensor(directions), torch.tensor(jitter))
+    found = march_packed(grid, box, march, *rays, 1 << 15)
+    np.testing.assert_array_equal(found.ray.numpy(), kernel.ray[:n])
+    np.testing.assert_allclose(found.points.numpy(), kernel.position[: 3 * n].reshape(n, 3), atol=1e-5)
+    np.testing.assert_allclose(found.distance.numpy(), kernel.distance[:n], rtol=1e-4)
+    before, total = depths_before(torch.tensor(kernel.tau[:n]), found.ray, 200)
+    np.testing.assert_allclose(torch.exp(-before - found.veil).numpy(), kernel.light[:n], rtol=1e-4)
+    np.testing.assert_allclose(torch.exp(-total - found.veil_behind).numpy(), passed, rtol=1e-4, atol=1e-5)
+    assert bool((found.veil_behind > 0).any()) == (min_weight > 0)
+    # Where there is no room for all, whole rays are left out, from the last on.
+    part = march_packed(grid, box, march, *rays, n // 2)
+    assert first[part.num_rays] < n // 2 <= first[part.num_rays + 1]
+    np.testing.assert_array_equal(part.points.numpy(), found.points[: first[part.num_rays]].numpy())
+
+
+def test_depths_run_along_each_ray_on_its_own():
+    tau = torch.tensor([3e4, 1e-3, 2e-3, 5.0])
+    before, total = depths_before(tau, torch.tensor([0, 2, 2, 2]), 4)
+    np.testing.assert_allclose(before.numpy(), [0.0, 0.0, 1e-3, 3e-3], rtol=1e-6)
+    np.testing.assert_allclose(total.numpy(), [3e4, 0.0, 5.003, 0.0], rtol=1e-6)
+    before, total = depths_before(tau[:0], torch.zeros(0, dtype=torch.int64), 2)
+    assert len(before) == 0
+    assert total.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_it_learns_as_well_as_the_kernels(scene):
+    """The same plan, through all stages: the loss falls as far, and a photo that was left out is met as well."""
+    with ThreadPoolExecutor(1) as executor:
+        work, image = photographed(scene, executor)
+        expected, actual = (learned(one, image) for one in (work, TorchFastTraining(work, CPU)))
+    # What two seeds of one learner differ by.
+    assert actual > expected - 1.0
+
+
+def learned(work: FieldTraining, image):
+    """PSNR of a photo after the whole plan, in dB."""
+    assert isinstance(work, FieldTraining)
+    state, reports = run(work, work.start(), PLAN.total_steps)
+    rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
+    losses = [report.loss for report in reports]
+    assert np.mean(losses[-5:]) < 0.1 * np.mean(losses[:5])
+    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
+    return psnr(shown, image.composited(FRAME.background if image.pixels.shape[2] == 4 else np.zeros(3)))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_rays_that_meet_nothing_move_nothing(scene):
+    """What they show is the background, and a step from it is finite."""
+    with ThreadPoolExecutor(1) as executor:
+        work, _ = photographed(scene, executor)
+        empty = replace(work.occupancy, cells=np.zeros_like(work.occupancy.cells))
+        twin = TorchFastTraining(replace(work, occupancy=empty), CPU)
+        state = twin.start()
+        before = copied(state.host.field.decoder._asdict())
+        state, (report,) = run(twin, state, 1)
+    assert np.isfinite(report.loss)
+    assert not state.grid.velocity.any()
+    same_tensors(before, state.host.field.decoder._asdict())
+
+
+def test_the_field_survives_saving_and_is_rendered_without_torch():
+    with ThreadPoolExecutor(1) as executor:
+        work, image = photographed("around", executor)
+        twin = TorchFastTraining(work, CPU)
+        state, _ = run(twin, twin.start(), 30)
+        saved = copied(twin.to_tensors(state))
+        same_tensors(twin.to_tensors(twin.from_tensors(saved)), saved)
+        rays = rays_from_view(image.camera, image.cam_from_world)
+        shown = twin.renderer(state)(rays)
+        again = renderer(field_from_tensors(saved), work.frame, executor)(rays)
+    np.testing.assert_array_equal(shown.rgb, again.rgb)
+    np.testing.assert_array_equal(shown.depth, again.depth)
+
+
+@pytest.mark.parametrize("stop", [1, 12])
+def test_a_stop_changes_nothing(stop):
+    """On the CPU, where torch adds in a fixed order, not a bit."""
+    with ThreadPoolExecutor(1) as executor:
+        plan = replace(PLAN, steps=(5, 5, 3, 3, 1, 1, 1, 1))
+        work = TorchFastTraining(photographed("no alpha", executor, plan)[0], CPU)
+        through, _ = run(work, work.start(), plan.total_steps)
+        stopped, _ = run(work, work.start(), stop)
+        saved = copied(work.to_tensors(stopped))
+        resumed, _ = run(work, work.from_tensors(saved), plan.total_steps - stop)
+        same_tensors(work.to_tensors(through), work.to_tensors(resumed))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_learns_as_torch_does_on_the_cpu():
+    with ThreadPoolExecutor(1) as executor:
+        work, _ = photographed("alpha", executor)
+        mse = []
+        for device in (CPU, torch.device("cuda")):
+            learner = TorchFastTraining(work, device)
+            _, reports = run(learner, learner.start(), PLAN.total_steps)
+            mse.append(np.mean([report.mse for report in reports[-10:]]))
+    assert abs(10 * np.log10(mse[1] / mse[0])) < 1.0
