@@ -29,6 +29,7 @@ def forward_and_backward(
     points=None,
     point_weight=0.0,
     emptiness=0.0,
+    free_weight=0.0,
 ) -> tuple[float, Decoder, np.ndarray, Samples, int, np.ndarray]:
     """Squared colour errors, the gradient of the loss by group, the samples of all rays, and the gradient of gains.
 
@@ -61,7 +62,8 @@ def forward_and_backward(
     decode_directions(field.decoder, directions.reshape(-1), count, per_ray)
     decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
     d_weight, d_gain = np.full(ROOM, 7.0, np.float32), np.zeros(3 * count, np.float32)
-    point_terms(samples, count, first, rows, on_rays, march.step, np.float32(point_weight), d_weight)
+    weights = np.float32(point_weight), np.float32(free_weight)
+    point_terms(samples, count, first, rows, free_before(count), on_rays, march.step, *weights, d_weight)
     loss = composite_backward(
         samples, count, first, passed, target.reshape(-1), background.reshape(-1), gain.reshape(-1), rgb, d_weight,
         np.float32(2), np.float32(sparsity), np.float32(emptiness), d_color, d_raw, d_gain,
@@ -103,20 +105,27 @@ def known_points(rng, directions) -> tuple[np.ndarray, PointRays]:
     return rows, PointRays(*np.stack([distance, sigma, np.ones(count // 2)]).astype(np.float32))
 
 
-def point_loss(points, samples, n, step, weight) -> np.ndarray:
+def free_before(count) -> np.ndarray:
+    """Distances up to which rays probably meet nothing; some end before the box, some behind it."""
+    return np.linspace(2.5, 5.5, count).astype(np.float32)
+
+
+def point_loss(points, samples, n, step, weight, free_weight) -> np.ndarray:
     """What the weight of each sample counts, by the definition."""
     rows, on_rays = points
     row = rows[samples.ray[:n]]
     margin = 2.0 * on_rays.sigma[row] + step
     before = samples.distance[:n] < on_rays.distance[row] - margin
     there = (samples.distance[:n] <= on_rays.distance[row] + margin) & ~before
-    return np.where(row < 0, 0.0, weight * (before.astype(float) - there))
+    early = samples.distance[:n] < free_before(len(rows))[samples.ray[:n]]
+    return np.where(row < 0, free_weight * early, weight * (before.astype(float) - there))
 
 
 @pytest.mark.parametrize(
-    ("sparsity", "point_weight", "emptiness"), [(0.0, 0.0, 0.0), (0.7, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.3)]
+    ("sparsity", "point_weight", "emptiness", "free_weight"),
+    [(0.0, 0.0, 0.0, 0.0), (0.7, 0.0, 0.0, 0.0), (0.0, 0.4, 0.0, 0.0), (0.0, 0.0, 0.3, 0.0), (0.0, 0.4, 0.0, 0.2)],
 )
-def test_gradients_match_autograd(case, sparsity, point_weight, emptiness):
+def test_gradients_match_autograd(case, sparsity, point_weight, emptiness, free_weight):
     torch = pytest.importorskip("torch")
     from fieldstone.field.torch_field import optical_depths, packed_colors, packed_weights, torch_fast_field
 
@@ -127,8 +136,9 @@ def test_gradients_match_autograd(case, sparsity, point_weight, emptiness):
     target[::3] = background[::3]
     points = known_points(rng, directions)
     loss, gradient, table, samples, n, d_gain = forward_and_backward(
-        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight, emptiness=emptiness
-    )
+        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight, emptiness=emptiness,
+        free_weight=free_weight,
+    )  # fmt: skip
     twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
     positions = torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64))
     ray = torch.tensor(samples.ray[:n].astype(np.int64))
@@ -141,7 +151,7 @@ def test_gradients_match_autograd(case, sparsity, point_weight, emptiness):
     theta = torch.tensor(np.log(gain.astype(np.float64)), requires_grad=True)
     squared = ((theta.exp() * colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
     opacity = torch.zeros(60, dtype=torch.float64).index_add(0, ray, weights)
-    by_sample = point_loss(points, samples, n, float(field.march(0.0, 0.0).step), point_weight)
+    by_sample = point_loss(points, samples, n, float(field.march(0.0, 0.0).step), point_weight, free_weight)
     depths = optical_depths(twin, positions, scale)
     total = squared + sparsity * opacity.sum() + (torch.tensor(by_sample) * weights).sum()
     total = total + emptiness * torch.log1p(depths[bare[ray]]).sum()

@@ -1,16 +1,19 @@
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME
 from fieldstone.field.floaters import places_in_box
-from fieldstone.field.free_space import FREE_SHARE, carve_free_space, corners_in_world
+from fieldstone.field.free_space import FREE_SHARE, PROBABLE_SHARE, carve_free_space, corners_in_world, probably_free
 from fieldstone.field.occupancy import full_box
 from fieldstone.field.projection import no_projection, project_points, projection_for
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.sim3 import Sim3
+from fieldstone.scene.rays import rays_from_view
 
 PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
 WALL = 4.0
@@ -122,3 +125,18 @@ def test_corners_come_back_to_the_grid(projected):
         m = np.abs(x).max(axis=1, keepdims=True)
         again = NORMALIZED_RADIUS * np.where(m > 1, (2 - 1 / np.maximum(m, 1)) / np.maximum(m, 1), 1.0) * x
     np.testing.assert_allclose(again, grid[finite], atol=1e-5)
+
+
+def test_photos_probably_see_nearly_as_far_as_the_points_around():
+    images, seen = wall_scene(2)
+    world = Sim3(0.5, np.eye(3), np.zeros(3))
+    frame = replace(FRAME, normalized_from_world=world)
+    for image in images:
+        found = probably_free(frame, seen)(image)
+        rays = rays_from_view(image.camera, image.cam_from_world)
+        true = 0.5 * WALL / rays.directions[:, 2]
+        # Blocks of pixels take the least of the points around them.
+        assert np.all(found < PROBABLE_SHARE * true * 1.02)
+        assert np.median(found / true) > 0.95 * PROBABLE_SHARE
+    unknown = probably_free(frame, {})(images[0])
+    np.testing.assert_array_equal(unknown, np.zeros(CAMERA.width * CAMERA.height))

@@ -130,7 +130,7 @@ def test_gradients_match_autograd_of_the_dense_twin():
     """The rows that a batch touches get the gradient that they have among all vertices; float64."""
     rng = np.random.default_rng(3)
     field = random_field(rng)
-    march, terms = field.march(0.0, 0.0), Terms(np.float32(0.7), np.float32(0.3), np.float32(0.4))
+    march, terms = field.march(0.0, 0.0), Terms(*(np.float32(weight) for weight in (0.7, 0.3, 0.4, 0.2)))
     origins, directions = (torch.tensor(a) for a in random_rays(rng, field, 60))
     velocity = np.zeros_like(field.table)
     grid = torch_grid(field.layout, field.table, velocity, CPU)
@@ -144,9 +144,11 @@ def test_gradients_match_autograd_of_the_dense_twin():
     target[::3] = background[::3]
     image = torch.tensor(rng.integers(0, 4, 60))
     log_gain = rng.uniform(-0.3, 0.3, 12)
+    free = torch.tensor(rng.uniform(2.5, 5.5, 60))
     rays = TorchRays(
-        origins.double(), directions.double(), directions.double(), target, background, image, torch.zeros(60), window
-    )
+        origins.double(), directions.double(), directions.double(), target, background, image, torch.zeros(60), window,
+        free,
+    )  # fmt: skip
     double = replace(grid, vertices=grid.vertices.double(), per_unit=torch.tensor(1.0 / field.layout.spacings))
     found = step_gradient(field, double, march, terms, Exposure(log_gain, log_gain, log_gain), rays, samples)
 
@@ -162,6 +164,7 @@ def test_gradients_match_autograd_of_the_dense_twin():
     depths = optical_depths(twin, samples.points, scale)
     loss = squared + float(terms.sparsity) * weights.sum() + float(terms.emptiness) * torch.log1p(depths[bare]).sum()
     loss = loss + float(terms.points) * (weights[before].sum() - weights[there].sum())
+    loss = loss + float(terms.free) * weights[samples.distance < free[ray]].sum()
     parameters = [*twin.levels, *(twin.decoder[name] for name in Decoder._fields), theta]
     expected = [0.5 * float(GRADIENT_SCALE) * g.numpy() for g in torch.autograd.grad(loss, parameters)]
     assert found.squared_error == pytest.approx(squared.item(), rel=1e-9)

@@ -82,6 +82,8 @@ class FastPlan:
     """Step of the logarithm of a photo's exposure, at the start of training; 0: all photos are alike."""
     point_weight: float = 0.0
     """Weight of light that misses a known point against the squared colour error of its ray; falls with the rates."""
+    free_weight: float = 0.0
+    """Weight of light that ends early, for what the known points around a ray say, against its squared colour error."""
     refine_poses: bool = False
     """Move the photos between stages so that the field fits them, see `pose_refinement`."""
     stop_after: int | None = None
@@ -186,7 +188,7 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
         return FastPlan(finest, steps, samples_per_chunk=room)
     return FastPlan(
         finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
-        clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5, clear_floaters_from=3,
+        clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5, free_weight=0.01, clear_floaters_from=3,
     )  # fmt: skip
 
 

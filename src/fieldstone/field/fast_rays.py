@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import NamedTuple
 
@@ -34,16 +35,25 @@ class RayTable(NamedTuple):
     rotations: np.ndarray
     """float32 (v, 3, 3): box axes from camera axes."""
     centers: np.ndarray
+    free: np.ndarray
+    """float32 (n): the ray probably meets nothing before this distance; 0 where nothing is known."""
     stride: int
 
 
 def ray_table(
-    images: tuple[PosedImage, ...], frame: FieldFrame, box: Box, executor: Executor, *, use_alpha: bool = True
+    images: tuple[PosedImage, ...],
+    frame: FieldFrame,
+    box: Box,
+    executor: Executor,
+    *,
+    use_alpha: bool = True,
+    free_of: Callable[[PosedImage], Float[np.ndarray, "p"]] | None = None,
 ) -> RayTable:
     """The table of all pixels whose rays meet an occupied cell, and some beside them (all, if the box is unbounded).
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
+        free_of: How far every pixel of a photo probably sees, see `RayTable.free`.
 
     Raises:
         InputError: No ray meets the box.
@@ -51,7 +61,7 @@ def ray_table(
     first_bearing, bearings = _bearings(images)
     rotations, centers = poses_in_frame(images, frame)
 
-    def rows_of(v: int) -> tuple[np.ndarray, np.ndarray]:
+    def rows_of(v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         camera = images[v].camera
         first = first_bearing[id(camera)]
         in_cam = bearings[first : first + camera.width * camera.height]
@@ -64,10 +74,11 @@ def ray_table(
             reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
         rows = np.flatnonzero(reached)
         whole_pixels = _rgba(images[v], frame, use_alpha).view(np.uint32)  # one number each is faster to take
-        return (rows + first).astype(np.int32), whole_pixels[rows].view(np.uint8)
+        free = np.zeros(len(rows), dtype=np.float32) if free_of is None else free_of(images[v])[rows]
+        return (rows + first).astype(np.int32), whole_pixels[rows].view(np.uint8), free
 
     parts = list(executor.map(rows_of, range(len(images))))
-    counts = [len(rows) for rows, _ in parts]
+    counts = [len(rows) for rows, _, _ in parts]
     total = sum(counts)
     if total == 0:
         raise InputError(
@@ -76,11 +87,12 @@ def ray_table(
         )
     return RayTable(
         image=np.repeat(np.arange(len(images), dtype=np.int32), counts),
-        bearing=np.concatenate([rows for rows, _ in parts]),
-        rgba=np.concatenate([rgba for _, rgba in parts]),
+        bearing=np.concatenate([rows for rows, _, _ in parts]),
+        rgba=np.concatenate([rgba for _, rgba, _ in parts]),
         bearings=bearings,
         rotations=rotations,
         centers=centers,
+        free=np.concatenate([free for _, _, free in parts]),
         stride=coprime_stride(total),
     )
 

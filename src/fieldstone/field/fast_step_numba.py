@@ -36,6 +36,8 @@ class RayBatch(NamedTuple):
     """Of that photo: how bright it shows each channel."""
     point: np.ndarray
     """Row of the known point on the ray, -1 without one."""
+    free: np.ndarray
+    """Distance before which the ray probably meets nothing."""
     jitter: np.ndarray
     first: np.ndarray
     passed: np.ndarray
@@ -140,6 +142,7 @@ def draw_rays(table, projection, gains, start, count, seed, background, rays, at
             rays.target[n * 3 + c] = color * alpha + background[c] * (np.float32(1) - alpha)
         rays.image[n] = v
         rays.point[n] = row
+        rays.free[n] = table.free[row]
         rays.jitter[n] = random_share(seed, start + k)
         if projection.active:
             project_ray_numba(projection, rays.origins, rays.directions, n)
@@ -185,7 +188,10 @@ def chunk_step(
     )  # fmt: skip
     decode_directions(decoder, rays.views, num_rays, work.per_ray)
     decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
-    point_terms(samples, num_rays, rays.first, rays.point, points, march.step, terms.points, work.d_weight)
+    point_terms(
+        samples, num_rays, rays.first, rays.point, rays.free, points, march.step, terms.points, terms.free,
+        work.d_weight,
+    )  # fmt: skip
     loss = composite_backward(
         samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb, work.d_weight,
         GRADIENT_SCALE, terms.sparsity, terms.emptiness, work.d_color, work.d_raw, work.d_gain,

@@ -23,6 +23,8 @@ class Terms(NamedTuple):
     """Optical depth, by its logarithm, on rays that show nothing but the background."""
     points: np.float32
     """Light that does not end at the known point of its ray."""
+    free: np.float32
+    """Light that ends where the points around a ray say that it probably meets nothing."""
 
 
 class PointRays(NamedTuple):
@@ -41,28 +43,32 @@ POINT_SIGMAS, POINT_STEPS = np.float32(2.0), np.float32(1.0)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def point_terms(samples, num_rays, first, rows, points, step, weight, d_weight):
-    """Light that does not end at a known point, twice where it ends before; 0 for rays without one.
+def point_terms(samples, num_rays, first, rows, free, points, step, weight, free_weight, d_weight):
+    """Light that does not end at a known point, twice where it ends before; on other rays, light that ends early.
 
     With w_i the weights and m the margin around the point at distance D of a ray, its loss is
 
         weight (sum_{t_i < D - m} w_i + 1 - sum_{D - m <= t_i <= D + m} w_i):
 
-    what a photo sees of a point, it sees through empty space, and the point is solid.
+    what a photo sees of a point, it sees through empty space, and the point is solid. Rays without a point have
 
-    rows: (r) row in points of each ray, negative: none. d_weight: (s).
+        free_weight sum_{t_i < free} w_i:
+
+    a little, so that what the photos clearly show stands there all the same.
+
+    rows: (r) row in points of each ray, negative: none. free: (r). d_weight: (s).
 
     Source:
         `deng2022` has the idea of points as supervision. Departure: a window in place of a normal distribution, so
         that nothing is said within the uncertainty of the point.
     """
-    half = np.float32(0.5) * weight
+    half, half_free = np.float32(0.5) * weight, np.float32(0.5) * free_weight
     for ray in range(num_rays):
         row = rows[ray]
         start, end = first[ray], first[ray + 1]
         if row < 0:
             for i in range(start, end):
-                d_weight[i] = np.float32(0)
+                d_weight[i] = half_free if at(samples.distance, i) < free[ray] else np.float32(0)
             continue
         margin = POINT_SIGMAS * points.sigma[row] + POINT_STEPS * step * points.stretch[row]
         low, high = points.distance[row] - margin, points.distance[row] + margin

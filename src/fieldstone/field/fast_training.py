@@ -38,7 +38,7 @@ from fieldstone.field.fast_terms_numba import PointRays, Terms
 from fieldstone.field.fast_update import move_grid, step_decoder
 from fieldstone.field.fast_workspace import RAYS_PER_KNOWN, Workspace, workspace
 from fieldstone.field.floaters import places_in_box, without_floaters
-from fieldstone.field.free_space import carve_free_space
+from fieldstone.field.free_space import carve_free_space, probably_free
 from fieldstone.field.known_points import known_rays, no_known_rays
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
 from fieldstone.field.occupancy_numba import used_cells
@@ -171,7 +171,8 @@ class FastTraining:
         background = self.frame.background.astype(np.float32)
         gains = gains_of(state.exposure)
         emptiness = 0.0 if self.alpha_known else plan.emptiness
-        terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(plan.point_weight * share))
+        points, free = plan.point_weight * share, plan.free_weight
+        terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(points), np.float32(free))
         num_known = self.num_known(state)
 
         def chunk(c: int) -> tuple[int, int, int, float]:
@@ -363,7 +364,8 @@ def fast_training(
         occupancy = carve_free_space(occupancy, images, frame, seen, projection, executor, unbounded=unbounded)
         logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
     all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
-    table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha)
+    free_of = probably_free(frame, seen) if seen and not projection.active else None
+    table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha, free_of=free_of)
     known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
     places = places_in_box(frame.normalized_from_world.apply(points), projection, unbounded=unbounded)
     movable = movable_photos(images, frame, seen) if refine_poses else ()

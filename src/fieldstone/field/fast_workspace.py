@@ -80,5 +80,5 @@ def room_for_rays(count: int) -> RayBatch:
 
     return RayBatch(
         floats(3), floats(3), floats(3), floats(3), floats(3), np.zeros(count, dtype=np.int32), floats(3),
-        np.zeros(count, dtype=np.int64), floats(1), np.zeros(count + 1, dtype=np.int64), floats(1),
+        np.zeros(count, dtype=np.int64), floats(1), floats(1), np.zeros(count + 1, dtype=np.int64), floats(1),
     )  # fmt: skip

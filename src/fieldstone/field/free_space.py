@@ -5,7 +5,7 @@ Without it, a field explains the photos best by a coloured cloud right in front 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
@@ -17,9 +17,13 @@ from fieldstone.field.projection import Projection, unproject_points
 from fieldstone.field.radiance_field import FieldFrame
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.geometry.camera import image_from_cam
+from fieldstone.scene.rays import pixel_centers
 
 FREE_SHARE = 0.7
 """Space is empty up to this share of the distance of known points: what has none may stand before them."""
+
+PROBABLE_SHARE = 0.92
+"""And probably up to this share of the least distance of the points around."""
 
 NEIGHBOURS = 8
 """Known points in a photo that speak for the pixels near them."""
@@ -102,6 +106,23 @@ def carve_free_space(
     cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(images) >= MANY_PHOTOS else 2)))
     cells &= ~around_some | parts_seen
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
+
+
+def probably_free(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable[[PosedImage], Float[np.ndarray, "p"]]:
+    """How far every pixel of a photo probably sees, in the frame; 0 where too little is known.
+
+    Unlike in `carve_free_space`, something may stand there: the distance is nearly that of the points around it.
+    """
+
+    def of_photo(image: PosedImage) -> Float[np.ndarray, "p"]:
+        camera, points = image.camera, seen.get(image.name)
+        if points is None or len(points.xyz) < MIN_SEEN:
+            return np.zeros(camera.width * camera.height, dtype=np.float32)
+        distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
+        least = least_distance(image, points.xyz, distances, pixel_centers(camera.width, camera.height))
+        return (PROBABLE_SHARE * frame.normalized_from_world.scale * least).astype(np.float32)
+
+    return of_photo
 
 
 def least_distance(

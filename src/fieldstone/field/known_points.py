@@ -64,7 +64,7 @@ def no_known_rays() -> tuple[RayTable, PointRays]:
     empty = np.zeros((0, 3), dtype=np.float32)
     table = RayTable(
         np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8), empty,
-        np.zeros((0, 3, 3), np.float32), empty, 1,
+        np.zeros((0, 3, 3), np.float32), empty, empty[:, 0].copy(), 1,
     )  # fmt: skip
     return table, PointRays(empty[:, 0].copy(), empty[:, 0].copy(), empty[:, 0].copy())
 
@@ -110,8 +110,9 @@ def known_rays(
     along = np.concatenate([part[3] for part in parts], axis=1).astype(np.float32)
     rows = np.arange(len(image), dtype=np.int32)
     table = RayTable(
-        image.astype(np.int32), rows, rgba, bearings.astype(np.float32), rotations, centers, coprime_stride(len(image))
-    )
+        image.astype(np.int32), rows, rgba, bearings.astype(np.float32), rotations, centers,
+        np.zeros(len(image), dtype=np.float32), coprime_stride(len(image)),
+    )  # fmt: skip
     return table, PointRays(*along)
 
 

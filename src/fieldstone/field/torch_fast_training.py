@@ -92,6 +92,8 @@ class TorchRays:
     jitter: Float[Tensor, "r"]
     window: Float[Tensor, "r 2"]
     """Distances between which light must end; -inf, -inf where nothing is known."""
+    free: Float[Tensor, "r"]
+    """Distance before which the ray probably meets nothing."""
 
     def first(self, count: int) -> TorchRays:
         """The first rays."""
@@ -136,7 +138,8 @@ class TorchFastTraining:
         samples = march_packed(state.grid, state.box, march, rays.origins, rays.directions, rays.jitter, room)
         rays = rays.first(samples.num_rays)
         emptiness = 0.0 if self.training.alpha_known else plan.emptiness
-        terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(plan.point_weight * share))
+        points, free = plan.point_weight * share, plan.free_weight
+        terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(points), np.float32(free))
         found = step_gradient(host.field, state.grid, march, terms, host.exposure, rays, samples)
         move_rows(state.grid, found.rows, found.vertices, self._rates(plan, share), plan.decay, float(EPSILON))
         moments, rate = (host.decoder_mean, host.decoder_square), np.float32(plan.decoder_rate * share)
@@ -191,6 +194,7 @@ class TorchFastTraining:
             draw_rays(table, work.projection, gains, start, number, seed, background, rays, at)
         window = np.full((num_known + count, 2), -np.inf, dtype=np.float32)
         window[:num_known] = window_of(work.points, rays.point[:num_known], float(march.step))
+        rays.free[:num_known] = 0.0
         return torch_rays(rays, window, self.device), num_known
 
 
@@ -215,6 +219,7 @@ def torch_rays(rays: RayBatch, window: Float[np.ndarray, "r 2"], device: torch.d
         image=copied(rays.image.astype(np.int64)),
         jitter=copied(rays.jitter),
         window=copied(window, 2),
+        free=copied(rays.free),
     )
 
 
@@ -231,7 +236,7 @@ def step_gradient(
 
     Per ray, with the terms of `composite_backward` and `point_terms`:
 
-        |exp(theta) C - target|^2 + sparsity (1 - T_end) + emptiness sum log(1 + tau_i) + points (...).
+        |exp(theta) C - target|^2 + sparsity (1 - T_end) + emptiness sum log(1 + tau_i) + points (...) + free (...).
 
     Args:
         field: Its decoder is used, its table is not.
@@ -258,6 +263,8 @@ def step_gradient(
     bare = torch.all(rays.target == rays.background, dim=1)[samples.ray]
     loss = squared + float(terms.sparsity) * torch.sum(1.0 - passed)
     loss = loss + float(terms.points) * torch.sum(weight * (early.to(dtype) - there.to(dtype)))
+    probably_free = samples.distance < rays.free[samples.ray]
+    loss = loss + float(terms.free) * torch.sum(weight * probably_free)
     loss = loss + float(terms.emptiness) * torch.sum(torch.log1p(tau) * bare)
     parameters = [vertices, *decoder.values(), log_gain]
     of_vertices, *rest = torch.autograd.grad(0.5 * float(GRADIENT_SCALE) * loss, parameters)
