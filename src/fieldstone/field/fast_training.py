@@ -56,6 +56,9 @@ CELL_VERTICES = 2
 SOLID = 0.1
 """A cell is solid where a step takes this optical depth."""
 
+POSE_STEPS = 3
+"""Steps of every photo at such a time."""
+
 POSES_AT = (2, 3, 4, 5, 6)
 """Stages that begin with refined poses, if the plan has them: what coarse grids show is too blurred to tell."""
 
@@ -219,7 +222,9 @@ class FastTraining:
     def _with_refined_poses(self, state: FastState) -> FastState:
         gains = gains_of(state.exposure).astype(np.float64).reshape(-1, 3)
         render_rays = in_world(self.renderer(state), self.frame)
-        moved = refined(self.movable, state.moved, render_rays, gains, self.frame.background)
+        moved = state.moved
+        for _ in range(POSE_STEPS):
+            moved = refined(self.movable, moved, render_rays, gains, self.frame.background)
         turned_deg = np.rad2deg(np.linalg.norm(moved[:, :3], axis=1))
         logger.info("poses refined: turned by %.4f deg in the median", np.median(turned_deg))
         return replace(state, moved=moved, rays=self._rays_from(moved))

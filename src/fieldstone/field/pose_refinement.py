@@ -30,8 +30,8 @@ SIZE_PX = 112
 SIGMA_PX = 0.5
 """Standard deviation of a known point in a photo, in pixels of the photo."""
 
-MIN_POINTS = 20
-"""Photos that see fewer are held as if they saw the corners of a cube in the middle of the scene this often."""
+MIN_POINTS, UNKNOWN_SIGMA_PX = 20, 3.0
+"""Photos that see fewer are held as if they saw the corners of a cube in the middle of the scene, this exactly."""
 
 SAME_ERROR = 30.0
 """Neighbouring pixels are wrong together: so many count as one."""
@@ -63,14 +63,16 @@ def movable_photos(
         seen: Known points of each photo by name, in the world.
     """
     corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-    middle = np.repeat(frame.normalized_from_world.inverse().apply(corners), MIN_POINTS // len(corners) + 1, axis=0)
+    middle = frame.normalized_from_world.inverse().apply(corners)
     out = []
     for image, small in zip(images, reduce_images(images, SIZE_PX), strict=True):
         known = (seen or {}).get(image.name)
-        points = middle if known is None or len(known.xyz) < MIN_POINTS else known.xyz
+        points, sigma_px = middle, UNKNOWN_SIGMA_PX
+        if known is not None and len(known.xyz) >= MIN_POINTS:
+            points, sigma_px = known.xyz, SIGMA_PX
         J = pixels_by_pose(image.camera, image.cam_from_world, points)
         J = J[np.isfinite(J).all(axis=(1, 2))]
-        out.append(MovablePhoto(small, np.einsum("nki,nkj->ij", J, J) / SIGMA_PX**2))
+        out.append(MovablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
     return tuple(out)
 
 
