@@ -241,9 +241,12 @@ def run() -> NoReturn:
     default threshold of the garbage collector would have it look through all modules again and again while they load.
     """
     gc.set_threshold(GC_THRESHOLD)
-    code = main()
+    try:
+        code = main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has seen enough
+        code = 0
     logging.shutdown()
-    sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,10 +86,7 @@ def render_run(
         def images() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             for k in range(frames):
                 view = render_view(render_rays, camera, poses_on_path[k])
-                if show == "confidence":
-                    yield quantize(confidence_image(view, camera, poses_on_path[k], photos).astype(np.float32))
-                else:
-                    yield quantize(_shown(view, show, camera, near, far))
+                yield quantize(_shown(view, show, camera, poses_on_path[k], near, far, photos))
                 on_frame(k + 1, frames)
 
         name = name if show == "color" else f"{name}_{show}"
@@ -120,11 +117,21 @@ def _photos(header: Mapping[str, Any], poses: Rigid3) -> list[tuple[Camera, Rigi
     return [(cameras[c], poses[k]) for k, c in enumerate(header["camera_of_view"])]
 
 
-def _shown(view: RenderedView, show: Shown, camera: Camera, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
+def _shown(
+    view: RenderedView,
+    show: Shown,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    near: float,
+    far: float,
+    photos: Sequence[tuple[Camera, Rigid3]],
+) -> Float[np.ndarray, "h w 3"]:
     if show == "depth":
         return depth_image(view, near, far).astype(np.float32)
     if show == "normals":
         return normal_image(view, camera).astype(np.float32)
+    if show == "confidence":
+        return confidence_image(view, camera, cam_from_world, photos).astype(np.float32)
     if show == "opacity":
         return np.repeat(view.opacity[:, :, None], 3, axis=2)
     return view.rgb
