@@ -88,7 +88,7 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
     background = training.frame.background.astype(np.float32)
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
     gains = gains_of(state.exposure)
-    rates, velocity = np.zeros(8, np.float32), state.velocity
+    rates, kept, velocity = np.zeros(8, np.float32), np.ones(8, np.float32), state.velocity
     tiny, decay = np.float32(1e-8), np.float32(plan.decay)
 
     def draw() -> None:
@@ -111,7 +111,8 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
     def composite() -> None:
         composite_backward(
             samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb,
-            work.d_weight, np.float32(1e-2), np.float32(plan.sparsity), work.d_color, work.d_raw, work.d_gain,
+            work.d_weight, np.float32(1e-2), np.float32(plan.sparsity), np.float32(0), work.d_color, work.d_raw,
+            work.d_gain,
         )  # fmt: skip
 
     def back() -> None:
@@ -135,11 +136,11 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
             if level < levels - plan.immediate_levels:
                 add_gradient(*arguments, room.gradient, room.touched)
             else:
-                step_by_sample(*arguments, velocity, rates, decay, tiny)
+                step_by_sample(*arguments, velocity, rates, kept, decay, tiny)
 
     def step() -> None:
         touched = len(room.touched)
-        step_touched(field.table, velocity, room.gradient, room.touched, 0, touched, rates, decay, tiny)
+        step_touched(field.table, velocity, room.gradient, room.touched, 0, touched, rates, kept, decay, tiny)
 
     rows = [("draw rays", best(draw)), ("march and interpolate", best(march)), ("decode", best(decode))]
     rows += [("composite, loss", best(composite)), ("decode backward", best(back))]

@@ -3,6 +3,7 @@ import pytest
 
 from fieldstone.field.fast_grid import CHANNELS, grid_layout, interpolate, level_resolutions
 from fieldstone.field.fast_grid_numba import BLOCK, add_gradient, interpolate_numba, step_by_sample, step_touched
+from fieldstone.field.fast_update import WORD
 
 EXTENT = np.array([2.0, 1.3, 0.9])
 RESOLUTIONS = (4, 8, 16)
@@ -88,9 +89,11 @@ def test_step_moves_only_what_has_a_gradient():
     touched = np.zeros(size // BLOCK, dtype=np.uint8)
     touched[np.flatnonzero(gradient) // BLOCK] = 1
     rates = np.array([0.3, 0.1, 0.1, 0.1] * 2, dtype=np.float32)
+    kept = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
     v = np.where(gradient != 0, 0.9 * velocity + 0.1 * gradient**2, velocity)
-    p = table - np.where(gradient != 0, np.tile(rates, size // 8) * gradient / (np.sqrt(v) + 1e-8), 0)
-    step_touched(table, velocity, gradient, touched, 0, len(touched), rates, np.float32(0.9), np.float32(1e-8))
+    step = np.tile(rates, size // 8) * gradient / (np.sqrt(v) + 1e-8)
+    p = np.where(gradient != 0, np.tile(kept, size // 8) * table - step, table)
+    step_touched(table, velocity, gradient, touched, 0, len(touched), rates, kept, np.float32(0.9), np.float32(1e-8))
     np.testing.assert_allclose(table, p, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(velocity, v, rtol=1e-5)
     assert not gradient.any()
@@ -103,18 +106,27 @@ def test_stepping_by_sample_is_stepping_one_sample_after_the_other():
     gradient = rng.normal(size=(len(points), layout.num_levels, CHANNELS)).astype(np.float32)
     velocity = np.abs(rng.normal(size=table.shape)).astype(np.float32)
     rates = np.array([0.3, 0.1, 0.1, 0.1] * 2, dtype=np.float32)
+    kept = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
     p, v = table.astype(np.float64), velocity.astype(np.float64)
     for n in range(len(points)):
         only_last = np.where(np.arange(layout.num_levels)[None, :, None] == level, gradient[n : n + 1], 0)
         g = gradient_by_basis(layout, points[n : n + 1].astype(np.float64), only_last)
-        seen = g != 0
+        i, j, k = (points[n] * layout.arrays(table).per_unit[level]).astype(np.int64)
+        reached = np.zeros(len(p))
+        layout.level(reached, level)[i : i + 2, j : j + 2, k : k + 2] = 1.0  # also those with weight 0
+        seen = reached > 0
         v[seen] = 0.9 * v[seen] + 0.1 * g[seen] ** 2
-        rate = np.tile(rates, len(p) // 8)
-        p[seen] -= rate[seen] * g[seen] / (np.sqrt(v[seen]) + 1e-8)
+        rate, keep = (np.tile(values, len(p) // 8) for values in (rates, kept))
+        p[seen] = keep[seen] * p[seen] - rate[seen] * g[seen] / (np.sqrt(v[seen]) + 1e-8)
     for half in (0, 1):
         step_by_sample(
             layout.arrays(table), level, half, np.array([len(points)]), len(points), points.reshape(-1),
-            gradient.reshape(-1), 4 * layout.num_levels, velocity, rates, np.float32(0.9), np.float32(1e-8),
+            gradient.reshape(-1), 4 * layout.num_levels, velocity, rates, kept, np.float32(0.9), np.float32(1e-8),
         )  # fmt: skip
-    # Points on a face of a cell have weight 0 for some vertices, whose memory the kernel shortens.
     np.testing.assert_allclose(table, p, rtol=1e-3, atol=1e-4)
+
+
+def test_levels_begin_where_pieces_of_the_table_may():
+    for resolutions in ((3,), (5, 10, 20), (7, 14)):
+        layout = grid_layout(np.array([1.0, 0.7, 0.4]), resolutions)
+        assert not np.any(layout.offsets % WORD)

@@ -226,3 +226,28 @@ def test_a_budget_is_shared_out_and_corrected():
     assert slower.steps[:3] == plan.steps[:3]
     assert sum(slower.steps[3:]) == pytest.approx(3.0 / 0.05, abs=2)
     assert min(plan_for_budget(PLAN, 0.1, 5.0, 0.01).steps) == 1
+
+
+def test_densities_of_fine_levels_give_up_a_share_where_they_move():
+    """p loses rate * decay * p, there and nowhere else, besides the step of a plan without decay."""
+    steps, first = (1, 1, 5, 1, 1, 1, 1, 1), 3
+    plan = FastPlan(64, steps, num_chunks=4, samples_per_chunk=512, scout=False, immediate_levels=0, fine_decay=0.0)
+    moved = {}
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor, plan)
+        start, _ = run(work, work.start(), first)
+        saved = {name: array.copy() for name, array in work.to_tensors(start).items()}
+        before = work.from_tensors(saved).field.table.copy()
+        for decay in (0.0, 0.5):
+            state = work.from_tensors(saved).with_plan(replace(plan, fine_decay=decay))
+            moved[decay] = work.step(state)[0].field
+    layout, rate = moved[0.0].layout, plan.density_rate * plan.rate_share(first)
+    assert layout.num_levels == 3
+    for level in range(3):
+        old, plain, decayed = (layout.level(table, level) for table in (before, moved[0.0].table, moved[0.5].table))
+        expected = plain.copy()
+        touched = plain[..., 0] != old[..., 0]
+        assert touched.any()
+        share = (0.0, 0.5 / 1.5, 0.5)[level]
+        expected[..., 0] -= np.where(touched, share * rate * old[..., 0], 0)
+        np.testing.assert_allclose(decayed, expected, rtol=1e-5, atol=1e-6)

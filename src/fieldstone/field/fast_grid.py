@@ -16,8 +16,9 @@ from jaxtyping import Float, Int
 CHANNELS = 4
 """Numbers per vertex: raw density, then three colour features."""
 
-PADDING = 64
-"""Unused numbers behind each level, so that eight-lane loads at its last vertex stay inside the table."""
+PADDING = 128
+"""Unused numbers behind each level, so that eight-lane loads at its last vertex stay inside the table; levels begin at
+multiples of it, where pieces of the table are cut."""
 
 
 class GridArrays(NamedTuple):

@@ -133,19 +133,19 @@ def add_gradient(grid, level, half, counts, capacity, positions, gradient, width
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def step_touched(table, velocity, gradient, touched, first, last, rates, decay, epsilon):
+def step_touched(table, velocity, gradient, touched, first, last, rates, kept, decay, epsilon):
     """One RMSprop step of the values with a gradient in blocks `first` to `last` (multiples of 8); clears both.
 
-    v <- decay v + (1 - decay) g^2,   p <- p - rate g / (sqrt(v) + epsilon).
+    v <- decay v + (1 - decay) g^2,   p <- kept p - rate g / (sqrt(v) + epsilon).
 
-    rates: (8,) step per channel, twice. Values that no sample touched keep p and v: a vertex that is seen once in a
+    rates, kept: (8,) by channel, twice. Values that no sample touched keep p and v: a vertex that is seen once in a
     hundred batches must not drift in between.
 
     Source:
-        `tieleman2012`. Departure: no step where the gradient is exactly 0.
+        `tieleman2012`; kept as in `loshchilov2019`, algorithm 2. Departure: no step where the gradient is exactly 0.
     """
     zero, keep, new, tiny = spread8(0), spread8(decay), spread8(np.float32(1) - decay), spread8(epsilon)
-    rate = load8(rates, 0)
+    rate, keep_value = load8(rates, 0), load8(kept, 0)
     blocks = np.empty(last - first + AHEAD, np.int64)
     count = 0
     words = touched.view(np.uint64)
@@ -165,7 +165,7 @@ def step_touched(table, velocity, gradient, touched, first, last, rates, decay, 
             i = at(blocks, n) + part * 8
             g, v, p = load8(gradient, i), load8(velocity, i), load8(table, i)
             v_new = fma8(keep, v, mul8(new, mul8(g, g)))
-            p_new = sub8(p, div8(mul8(rate, g), add8(sqrt8(v_new), tiny)))
+            p_new = sub8(mul8(keep_value, p), div8(mul8(rate, g), add8(sqrt8(v_new), tiny)))
             store8(velocity, i, where_nonzero8(g, v_new, v))
             store8(table, i, where_nonzero8(g, p_new, p))
             store8(gradient, i, zero)
@@ -173,7 +173,9 @@ def step_touched(table, velocity, gradient, touched, first, last, rates, decay, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def step_by_sample(grid, level, half, counts, capacity, positions, gradient, width, velocity, rates, decay, epsilon):
+def step_by_sample(
+    grid, level, half, counts, capacity, positions, gradient, width, velocity, rates, kept, decay, epsilon
+):
     """The step of `step_touched` for every sample at once, without a gradient table, on one half of one level.
 
     On the finest level hardly two samples of a batch meet in a vertex, and what costs is memory: this reads and
@@ -181,7 +183,7 @@ def step_by_sample(grid, level, half, counts, capacity, positions, gradient, wid
     """
     one = np.float32(1)
     keep, new, tiny = spread8(decay), spread8(one - decay), spread8(epsilon)
-    rate = load8(rates, 0)
+    rate, keep_value = load8(rates, 0), load8(kept, 0)
     for chunk in range(counts.shape[0]):
         end = chunk * capacity + counts[chunk]
         for sample in range(chunk * capacity, end):
@@ -198,6 +200,7 @@ def step_by_sample(grid, level, half, counts, capacity, positions, gradient, wid
                 g = mul8(spread8(one - fv), shared)
                 v = fma8(keep, load8(velocity, b), mul8(new, mul8(g, g)))
                 store8(velocity, b, v)
-                store8(grid.table, b, sub8(load8(grid.table, b), div8(mul8(rate, g), add8(sqrt8(v), tiny))))
+                p = mul8(keep_value, load8(grid.table, b))
+                store8(grid.table, b, sub8(p, div8(mul8(rate, g), add8(sqrt8(v), tiny))))
                 b += row
                 fv = one - fv

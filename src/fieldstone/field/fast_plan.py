@@ -33,7 +33,6 @@ MIN_STEPS = 60
 COARSEST_LEVEL = 14
 """Levels go down to about this many cells along the longest side."""
 
-
 MAX_FINEST = 384
 """Cells of the finest level along the longest side: 32 bytes each, dense, fit the memory of a laptop."""
 
@@ -68,6 +67,9 @@ class FastPlan:
     by then goes too."""
     clear_fog_from: int = len(STAGE_SHARES)
     """From this stage on, cells that are no denser than at the start are given up too."""
+    fine_decay: float = 0.02
+    """What the density of a vertex of the finest level gives up with every step, as a share of itself by rate; coarser
+    levels give up less, the coarsest nothing. Fine levels then add to coarse ones only what photos insist on."""
     immediate_levels: int = 1
     """Finest levels that move sample by sample."""
     scout: bool = True
@@ -189,6 +191,7 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
     return FastPlan(
         finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
         clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5, free_weight=0.01, clear_floaters_from=3,
+        fine_decay=0.06,
     )  # fmt: skip
 
 

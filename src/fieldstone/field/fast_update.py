@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,15 +15,36 @@ from jaxtyping import Float, Int
 from fieldstone.field.fast_decoder import Decoder
 from fieldstone.field.fast_field import FastField
 from fieldstone.field.fast_grid import CHANNELS
-from fieldstone.field.fast_grid_numba import add_gradient, step_by_sample, step_touched
+from fieldstone.field.fast_grid_numba import BLOCK, add_gradient, step_by_sample, step_touched
 from fieldstone.field.fast_plan import FastPlan
 from fieldstone.field.fast_workspace import Workspace
 
 EPSILON = np.float32(1e-8)
 DECODER_MEMORY = (0.9, 0.99)
 
+WORD = 8 * BLOCK
+"""Pieces of the table begin at multiples of so many values, and so do levels."""
+
 SPLITS = 8
-"""Pieces of the table that `step_touched` is split into."""
+"""Pieces that a level is split into by `step_touched`, if it has at least `SPLIT_WORDS`."""
+
+SPLIT_WORDS = 64
+
+DECAY_BY_LEVEL = 1.5
+"""A level gives up so many times as much of itself as the next coarser one."""
+
+
+def rates_of(plan: FastPlan, share: float) -> Float[np.ndarray, "4"]:
+    """Step by channel, with this share of the first learning rates."""
+    return np.array([plan.density_rate, *[plan.feature_rate] * (CHANNELS - 1)], dtype=np.float32) * np.float32(share)
+
+
+def kept_of(plan: FastPlan, share: float, num_levels: int) -> Float[np.ndarray, "l 4"]:
+    """What a step leaves of the values of a vertex of each level, coarse to fine, by channel."""
+    kept = np.ones((num_levels, CHANNELS), dtype=np.float32)
+    finer = np.arange(1, num_levels)
+    kept[1:, 0] -= plan.density_rate * share * plan.fine_decay * DECAY_BY_LEVEL ** (finer - float(num_levels - 1))
+    return kept
 
 
 def move_grid(
@@ -41,10 +63,9 @@ def move_grid(
         counts: Samples of each chunk.
         share: Of the first learning rates.
     """
-    rates = np.full(8, plan.feature_rate * share, dtype=np.float32)
-    rates[[0, CHANNELS]] = plan.density_rate * share
-    decay = np.float32(plan.decay)
     levels = field.layout.num_levels
+    rates, kept = np.tile(rates_of(plan, share), 2), np.tile(kept_of(plan, share, levels), 2)
+    decay = np.float32(plan.decay)
     first_immediate = max(levels - plan.immediate_levels, 0)
 
     def add(piece: tuple[int, int]) -> None:
@@ -56,19 +77,26 @@ def move_grid(
         if level < first_immediate:
             add_gradient(*arguments, room.gradient, room.touched)
         else:
-            step_by_sample(*arguments, velocity, rates, decay, EPSILON)
+            step_by_sample(*arguments, velocity, rates, kept[level], decay, EPSILON)
 
     list(executor.map(add, [(level, half) for level in reversed(range(levels)) for half in (0, 1)]))
-    words = len(room.touched) // 8
-    bounds = [8 * (words * piece // SPLITS) for piece in range(SPLITS + 1)]
 
-    def move(piece: int) -> None:
+    def move(piece: tuple[int, int, int]) -> None:
+        level, first, last = piece
         step_touched(
-            field.table, velocity, room.gradient, room.touched, bounds[piece], bounds[piece + 1], rates, decay,
-            EPSILON,
-        )  # fmt: skip
+            field.table, velocity, room.gradient, room.touched, 8 * first, 8 * last, rates, kept[level], decay, EPSILON
+        )
 
-    list(executor.map(move, range(SPLITS)))
+    words = field.layout.offsets // WORD
+    list(executor.map(move, [piece for level in range(first_immediate) for piece in _pieces(level, words)]))
+
+
+def _pieces(level: int, words: Int[np.ndarray, "l_plus_1"]) -> list[tuple[int, int, int]]:
+    """A level in ranges of words: (level, first, last)."""
+    start, end = words[level : level + 2].tolist()
+    parts = SPLITS if end - start >= SPLIT_WORDS else 1
+    bounds = [start + (end - start) * k // parts for k in range(parts + 1)]
+    return [(level, first, last) for first, last in pairwise(bounds)]
 
 
 def step_decoder(

@@ -33,7 +33,7 @@ from fieldstone.field.fast_state import FastState, next_rays
 from fieldstone.field.fast_step_numba import GRADIENT_SCALE, RayBatch, draw_rays
 from fieldstone.field.fast_terms_numba import POINT_SIGMAS, POINT_STEPS, PointRays, Terms
 from fieldstone.field.fast_training import FastTraining
-from fieldstone.field.fast_update import EPSILON, step_decoder
+from fieldstone.field.fast_update import EPSILON, kept_of, rates_of, step_decoder
 from fieldstone.field.fast_workspace import RAYS_PER_KNOWN, room_for_rays
 from fieldstone.field.radiance_field import RayRenderer, StepReport
 from fieldstone.field.torch_field import composite_packed, decode, depths_before, optical_depths_of
@@ -141,7 +141,9 @@ class TorchFastTraining:
         points, free = plan.point_weight * share, plan.free_weight
         terms = Terms(np.float32(plan.sparsity), np.float32(emptiness), np.float32(points), np.float32(free))
         found = step_gradient(host.field, state.grid, march, terms, host.exposure, rays, samples)
-        move_rows(state.grid, found.rows, found.vertices, self._rates(plan, share), plan.decay, float(EPSILON))
+        rates = torch.tensor(rates_of(plan, share), device=self.device)
+        kept = torch.tensor(kept_of(plan, share, host.field.layout.num_levels), device=self.device)
+        move_rows(state.grid, found.rows, found.vertices, rates, kept, plan.decay, float(EPSILON))
         moments, rate = (host.decoder_mean, host.decoder_square), np.float32(plan.decoder_rate * share)
         step_decoder(host.field.decoder, *moments, [found.decoder], host.step + 1, rate)
         if plan.exposure_rate > 0:
@@ -176,10 +178,6 @@ class TorchFastTraining:
             torch_grid(field.layout, field.table, host.velocity, self.device),
             torch_box(field.occupancy, field.layout.extent, field.unbounded, self.device),
         )
-
-    def _rates(self, plan: FastPlan, share: float) -> Float[Tensor, "4"]:
-        rates = np.array([plan.density_rate, *[plan.feature_rate] * 3], dtype=np.float32)
-        return torch.tensor(rates * np.float32(share), device=self.device)
 
     def _drawn(self, host: FastState, count: int, march: March) -> tuple[TorchRays, int]:
         """The next `count` rays of the table behind those to known points, and how many these are."""

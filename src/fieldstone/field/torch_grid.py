@@ -76,6 +76,7 @@ def move_rows(
     rows: Int[Tensor, "k"],
     gradient: Float[Tensor, "k c"],
     rates: Float[Tensor, "c"],
+    kept: Float[Tensor, "l c"],
     decay: float,
     epsilon: float,
 ) -> None:
@@ -83,10 +84,12 @@ def move_rows(
 
     Args:
         rows: Each once.
+        kept: What each level keeps of itself, by channel.
     """
     vertices, velocity = grid.vertices[rows], grid.velocity[rows]
     v = decay * velocity + (1.0 - decay) * gradient**2
-    moved = vertices - rates * gradient / (torch.sqrt(v) + epsilon)
+    level = torch.searchsorted(grid.first, rows, right=True) - 1
+    moved = kept[level] * vertices - rates * gradient / (torch.sqrt(v) + epsilon)
     touched = gradient != 0
     grid.velocity[rows] = torch.where(touched, v, velocity)
     grid.vertices[rows] = torch.where(touched, moved, vertices)

@@ -63,7 +63,7 @@ def render_run(
 
     Returns:
         The file or folder written: `out`/renders/PATH.mp4, .gif, or `out`/renders/PATH/, with the name of a file for
-        PATH; PATH_depth and so on for what is not colour.
+        PATH (orbit_json for an orbit.json); PATH_depth and so on for what is not colour.
 
     Raises:
         InputError: No usable checkpoint in `out`, or no such path.
@@ -107,7 +107,11 @@ def _poses_on(path: str, poses: Rigid3, frames: int | None) -> tuple[str, Rigid3
         return path, PATHS[path](poses, frames or FRAMES)
     if path != "dataset" and not path.lower().endswith(".json"):
         raise InputError(f"--path {path}: give one of {', '.join(PATHS)}, dataset, or a file PATH.json with poses")
-    name, given = (path, poses) if path == "dataset" else (Path(path).stem, read_camera_path(Path(path)))
+    if path == "dataset":
+        name, given = path, poses
+    else:
+        name, given = Path(path).stem, read_camera_path(Path(path))
+        name = f"{name}_json" if name in (*PATHS, "dataset") else name
     return name, given if frames in (None, len(given.t)) else through(given, frames)
 
 

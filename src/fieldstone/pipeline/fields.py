@@ -262,9 +262,11 @@ def frame_from_header(header: Mapping[str, Any]) -> FieldFrame:
 
 
 def split_tensors(tensors: Mapping[str, np.ndarray]) -> tuple[Rigid3, dict[str, np.ndarray]]:
-    """Poses of the training views, and the state of the field, of a checkpoint."""
+    """Poses of the training views, as refined if they were, and the state of the field, of a checkpoint."""
     state = {name.removeprefix("state."): array for name, array in tensors.items() if name.startswith("state.")}
-    return Rigid3(tensors["views.R"], tensors["views.t"]), state
+    poses = Rigid3(tensors["views.R"], tensors["views.t"])
+    moved = state.get("moved")
+    return (poses if moved is None or not moved.any() else poses.retract(moved)), state
 
 
 def prefixed(tensors: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
