@@ -67,7 +67,7 @@ class FastPlan:
     by then goes too."""
     clear_fog_from: int = len(STAGE_SHARES)
     """From this stage on, cells that are no denser than at the start are given up too."""
-    fine_decay: float = 0.02
+    fine_decay: float = 0.01
     """What the density of a vertex of the finest level gives up with every step, as a share of itself by rate; coarser
     levels give up less, the coarsest nothing. Fine levels then add to coarse ones only what photos insist on."""
     immediate_levels: int = 1
