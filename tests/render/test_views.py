@@ -5,7 +5,14 @@ from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render import views
-from fieldstone.render.views import RenderedView, confidence_image, depth_image, normal_image, render_view
+from fieldstone.render.views import (
+    RenderedView,
+    confidence_image,
+    depth_image,
+    normal_image,
+    progressive_views,
+    render_view,
+)
 
 
 def render_ball(rays):
@@ -34,6 +41,32 @@ def test_view_of_a_ball(monkeypatch):
     assert abs(len(row) / area - 1) < 0.03
     nearest = view.depth[view.opacity > 0].min()
     assert distance - 1 <= nearest < distance - 1 + 0.01
+
+
+def test_progressive_views_render_every_pixel_once_and_end_in_the_view():
+    camera = Camera("PINHOLE", 43, 30, np.array([35.0, 35.0, 19.0, 14.0]))
+    pose = Rigid3(rotation.exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, -0.1, 4.0]))
+    counts = []
+
+    def counted(rays):
+        counts.append(len(rays))
+        return render_ball(rays)
+
+    whole = render_view(render_ball, camera, pose)
+    found = []
+    for view in progressive_views(counted, camera, pose):
+        assert view.depth.shape == (30, 43)
+        found.append(view)
+    assert counts[0] == 4 * 6
+    assert sum(counts) == 30 * 43
+    for name in ("rgb", "depth", "opacity"):
+        np.testing.assert_array_equal(getattr(found[-1], name), getattr(whole, name))
+        # A block of the coarsest view is the pixel in its middle, also where the photo cuts the block.
+        coarse, fine = getattr(found[0], name), getattr(whole, name)
+        assert np.all(coarse[8:16, 16:24] == fine[12, 20])
+        assert np.all(coarse[24:, 40:] == fine[28, 42])
+    errors = [np.abs(view.rgb - whole.rgb).mean() for view in found]
+    assert np.all(np.diff(errors) < 0)
 
 
 def test_pixels_outside_of_the_lens_are_empty():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,14 +85,36 @@ def confidence_image(
 
 def render_view(render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3) -> RenderedView:
     """What the camera sees, with `render_rays` for rays in the world."""
+    (view,) = progressive_views(render_rays, camera, cam_from_world, strides=(1,))
+    return view
+
+
+def progressive_views(
+    render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3, *, strides: Sequence[int] = (8, 4, 2, 1)
+) -> Iterator[RenderedView]:
+    """What the camera sees, sharper and sharper, for who moves through a scene and does not wait for all pixels.
+
+    Every view has the full size. With stride s, one pixel stands for s x s; those of earlier strides are not rendered
+    again, so that all views together cost what the last one costs, and a view that is no longer wanted costs nothing.
+
+    Args:
+        strides: Falling; the last one is 1 for the view of `render_view`.
+    """
     rays = rays_from_view(camera, cam_from_world)
-    reached = np.flatnonzero(np.all(np.isfinite(rays.directions), axis=1))
+    shape = (camera.height, camera.width)
+    missing = np.all(np.isfinite(rays.directions), axis=1)
     rgb = np.zeros((len(rays), 3), dtype=np.float32)
     depth = np.zeros(len(rays), dtype=np.float32)
     opacity = np.zeros(len(rays), dtype=np.float32)
-    for start in range(0, len(reached), RAYS_AT_ONCE):
-        rows = reached[start : start + RAYS_AT_ONCE]
-        rendered = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
-        rgb[rows], depth[rows], opacity[rows] = rendered.rgb, rendered.depth, rendered.opacity
-    shape = (camera.height, camera.width)
-    return RenderedView(rgb.reshape(*shape, 3), depth.reshape(shape), opacity.reshape(shape))
+    for stride in strides:
+        row, column = (np.minimum(np.arange(n) // stride * stride + stride // 2, n - 1) for n in shape)
+        shown = row[:, None] * camera.width + column
+        wanted = np.zeros(len(rays), dtype=bool)
+        wanted[shown] = True
+        wanted = np.flatnonzero(wanted & missing)
+        for start in range(0, len(wanted), RAYS_AT_ONCE):
+            rows = wanted[start : start + RAYS_AT_ONCE]
+            rendered = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
+            rgb[rows], depth[rows], opacity[rows] = rendered.rgb, rendered.depth, rendered.opacity
+        missing[wanted] = False
+        yield RenderedView(rgb[shown], depth[shown], opacity[shown])
