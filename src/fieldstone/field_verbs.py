@@ -38,6 +38,7 @@ def train(
     masks: Path | None = None,
     size: int | None = None,
     refine_poses: bool = False,
+    hold_out: str | None = None,
     device: str = "cpu",
     threads: int = 0,
     seed: int = 0,
@@ -62,6 +63,8 @@ def train(
         size: Photos are reduced to this length of their longer side, in pixels (fast only).
         refine_poses: Move the training photos a little, so that the field fits them; known points of a reconstruction
             hold them (fast only).
+        hold_out: Photos to measure with, by name, with commas between: a.jpg,b.jpg; none learns from all of them. By
+            default the test views of the source, or every 8th photo.
         device: cpu, cuda, mps; others than cpu need torch. The fast field was never tried on a GPU, and learns there
             the same field to rounding, not to the same bytes; it is rendered on the CPU.
         threads: 0 takes all cores. The result is the same for any number.
@@ -97,6 +100,7 @@ def train(
             "device": device,
             "threads": threads or None,
             "photos": photos,
+            "hold_out": None if hold_out is None else photo_names(hold_out),
             "on_step": show,
             "on_stage": lambda stage: progress.update(task, description=stage),
         }
@@ -233,6 +237,11 @@ def splat(source: Source, /, *, cells: int | None = None, level: float = 0.5, th
         markup=False,
     )
     return 0
+
+
+def photo_names(text: str) -> tuple[str, ...]:
+    """The names in a list with commas; none of them for the word none."""
+    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def seconds(text: str) -> float:

@@ -83,6 +83,9 @@ def test_train_and_render_as_typed(ball_folder, tmp_path, capsys):
     plan = write_plan(tmp_path / "plan.json")
     assert main(["train", str(ball_folder), "-o", str(out), "--plan", str(plan), "--no-alpha", "--threads", "1"]) == 0
     assert "PSNR" in capsys.readouterr().out
+    whole = ["train", str(ball_folder), "-o", str(tmp_path / "whole"), "--plan", str(plan), "--hold-out", "none"]
+    assert main([*whole, "--threads", "1"]) == 0
+    assert "no photo was held out" in capsys.readouterr().out
     assert main(["render", str(out), "--format", "png", "--frames", "2", "--threads", "1"]) == 0
     assert (out / "renders" / "orbit" / "0001.png").is_file()
     given = tmp_path / "orbit.json"

@@ -35,7 +35,23 @@ def test_every_eighth_photo_of_a_file_without_split_is_held_out(tmp_path, as_fil
     dataset = read_ray_dataset(folder / "transforms.json" if as_file else folder, None, 100)
     assert [image.name for image in dataset.test] == ["r_0.png", "r_8.png"]
     assert [image.name for image in dataset.train] == [f"r_{k}.png" for k in range(1, 8)]
-    assert read_ray_dataset(folder, None, 100, held_out=False).test == ()
+
+
+@pytest.mark.parametrize(
+    ("names", "tested"), [((), []), (("r_3.png",), [3]), (("r_3", "r_8.png"), [8, 3]), (("r_0", "r_8"), [0, 8])]
+)
+def test_other_photos_are_held_out_on_request(tmp_path, names, tested):
+    dataset = read_ray_dataset(write_transforms(tmp_path, alpha=True), None, 100, hold_out=names)
+    assert sorted(image.name for image in dataset.test) == sorted(f"r_{k}.png" for k in tested)
+    assert {image.name for image in dataset.train} == {f"r_{k}.png" for k in range(9) if k not in tested}
+
+
+def test_a_photo_to_hold_out_that_is_not_there_is_named(tmp_path):
+    folder = write_transforms(tmp_path, alpha=True)
+    with pytest.raises(InputError, match=r"--hold-out r_9.*r_1\.png"):
+        read_ray_dataset(folder, None, 100, hold_out=("r_3", "r_9"))
+    with pytest.raises(InputError, match="held out"):
+        read_ray_dataset(folder, None, 100, hold_out=tuple(f"r_{k}" for k in range(9)))
 
 
 def test_photos_with_alpha_show_an_object_in_a_box(tmp_path):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.photos import write_photo
-from fieldstone.pipeline.field_input import dataset_of, open_field_input, read_images, with_masks
+from fieldstone.pipeline.field_input import dataset_of, holding_out, open_field_input, read_images, with_masks
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
     CURVE,
@@ -118,6 +118,7 @@ def train_fast_run(
     masks: Path | None = None,
     size_px: int = MAX_SIZE_PX,
     refine_poses: bool = False,
+    hold_out: Sequence[str] | None = None,
     device: str = "cpu",
     on_step: OnStep = lambda point: None,
     on_stage: Callable[[str], None] = lambda stage: None,
@@ -138,6 +139,7 @@ def train_fast_run(
             the reconstruction, if it had some.
         size_px: Photos are reduced to this length of their longer side.
         refine_poses: Move the training photos so that the field fits them, held by known points. Held-out photos stay.
+        hold_out: Photos to measure with instead of the default, see `field_input.holding_out`.
         device: Where steps are computed: cpu, or a device of torch, see `torch_fast_training`. Equal plans then give
             equal fields to rounding only. Rendering stays on the CPU.
 
@@ -157,7 +159,7 @@ def train_fast_run(
         compile_kernels(executor, steps_by)
         started = time.perf_counter()
         on_stage("reading photos")
-        given_photos = with_masks(open_field_input(source, photos), masks, source)
+        given_photos = with_masks(holding_out(open_field_input(source, photos), hold_out), masks, source)
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         opened = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)

@@ -68,23 +68,25 @@ class FieldInput:
     """What each photo is known to see, by its name."""
 
 
-def read_ray_dataset(source: Path, photos: Path | None, image_size_px: int, *, held_out: bool = True) -> RayDataset:
+def read_ray_dataset(
+    source: Path, photos: Path | None, image_size_px: int, *, hold_out: Sequence[str] | None = None
+) -> RayDataset:
     """The dataset of a folder with posed photos; see `open_field_input`.
 
     Args:
         photos: Folder with the photos of a COLMAP model; None: `images` beside the model, where the reconstruction
             took them from, or the folder of the model.
         image_size_px: Photos are reduced to this length of their longer side.
-        held_out: False leaves the held-out photos unread; `read_held_out` reads them.
+        hold_out: Photos to hold out instead of those of the source, see `holding_out`.
 
     Raises:
         InputError: No posed photos, photos missing, or nothing to train on.
     """
-    return dataset_of(open_field_input(source, photos), image_size_px, held_out=held_out)
+    return dataset_of(holding_out(open_field_input(source, photos), hold_out), image_size_px)
 
 
 def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) -> RayDataset:
-    """Decode the photos of an input."""
+    """Decode the photos of an input; held_out=False leaves the held-out ones unread."""
     train = read_images(given.train, image_size_px, without_borders=True)
     test = read_images(given.test, image_size_px) if held_out else ()
     if not train:
@@ -102,6 +104,29 @@ def dataset_of(given: FieldInput, image_size_px: int, *, held_out: bool = True) 
         frame.far,
     )
     return RayDataset(train, test, frame, given.points_in_world, bounded, given.seen)
+
+
+def holding_out(given: FieldInput, names: Sequence[str] | None) -> FieldInput:
+    """The input with other photos held out.
+
+    Args:
+        names: Of the photos, or of their files with or without folder and suffix; empty: all are learned from. None:
+            nothing changes.
+
+    Raises:
+        InputError: There is no such photo.
+    """
+    if names is None:
+        return given
+    photos = (*given.train, *given.test)
+    known = [{photo.name, photo.path.name, photo.path.stem} for photo in photos]
+    for name in names:
+        if not any(name in of_photo for of_photo in known):
+            some = ", ".join(photo.path.name for photo in photos[:5])
+            raise InputError(f"--hold-out {name}: no such photo among {len(photos)} ({some}, ...)")
+    tested = [not of_photo.isdisjoint(names) for of_photo in known]
+    train, test = (tuple(p for p, out in zip(photos, tested, strict=True) if out == held) for held in (False, True))
+    return replace(given, train=train, test=test)
 
 
 def _masked_borders(images: Sequence[PosedImage]) -> list[PosedImage]:

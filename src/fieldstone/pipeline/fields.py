@@ -59,6 +59,7 @@ def train_run(
     device: str = "cpu",
     threads: int | None = None,
     photos: Path | None = None,
+    hold_out: Sequence[str] | None = None,
     on_step: OnStep = lambda point: None,
     on_stage: OnStage = lambda stage: None,
 ) -> dict[str, Any]:
@@ -73,6 +74,7 @@ def train_run(
         max_steps: Steps in all; None: no limit.
         threads: None: one per processor.
         photos: Folder with the photos of a reconstruction, if they are not where they were.
+        hold_out: Photos to measure with instead of the default, see `field_input.holding_out`.
 
     Returns:
         What `metrics.json` holds.
@@ -82,7 +84,7 @@ def train_run(
     """
     on_stage("reading photos")
     options = PRESETS[field]
-    dataset = read_ray_dataset(source, photos, options.image_size_px)
+    dataset = read_ray_dataset(source, photos, options.image_size_px, hold_out=hold_out)
     header = run_header(field, asdict(options), seed, dataset)
     threads = threads or os.cpu_count() or 1
     with open_training(options, dataset.frame, dataset, seed=seed, device=device, threads=threads) as training:
