@@ -1,3 +1,4 @@
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -60,6 +61,21 @@ def test_a_stop_does_not_change_a_bit(stop):
         stopped, _ = run(work, work.start(), stop)
         saved = {name: array.copy() for name, array in work.to_tensors(stopped).items()}
         resumed, _ = run(work, work.from_tensors(saved), PLAN.total_steps - stop)
+        same_tensors(work.to_tensors(through), work.to_tensors(resumed))
+
+
+@pytest.mark.parametrize("stop", [75, 120, 139])
+def test_a_stop_before_cells_change_their_size_does_not_change_a_bit(stop):
+    """Cells whose new size does not divide the old one reach vertices that had been given up."""
+    plan = replace(PLAN, finest=101, steps=(70, 60, 40, 20, 8, 8, 8, 8))
+    with ThreadPoolExecutor(2) as executor:
+        work = training(executor, plan, use_alpha=False)
+        state, _ = run(work, work.start(), stop)
+        saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
+        before = state.field.occupancy.cell_size
+        through, _ = run(work, state, 155 - stop)
+        assert through.field.occupancy.cell_size != before
+        resumed, _ = run(work, work.from_tensors(saved), 155 - stop)
         same_tensors(work.to_tensors(through), work.to_tensors(resumed))
 
 
@@ -217,6 +233,21 @@ def test_a_plan_survives_json_and_rates_fall():
     assert shares[-1] > PLAN.final_rate
     with pytest.raises(ValueError, match="plan"):
         plan_from_json('{"finest": 3}')
+
+
+def test_a_plan_of_before_densities_decayed_means_what_it_meant():
+    assert plan_from_json('{"finest": 64, "steps": [1, 1, 1, 1, 1, 1, 1, 1]}').fine_decay == 0.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"num_chunks": 0}, {"samples_per_chunk": -1}, {"min_weight": 0.0}, {"finest": 64.5}, {"decay": "x"},
+     {"steps": [10.5] * 8}, {"density_rate": float("nan")}, {"immediate_levels": -1}],
+)  # fmt: skip
+def test_settings_that_make_no_sense_are_named(wrong):
+    settings = json.loads(PLAN.to_json()) | wrong
+    with pytest.raises(ValueError, match=next(iter(wrong)).replace("steps", "step")):
+        plan_from_json(json.dumps(settings))
 
 
 def test_a_budget_is_shared_out_and_corrected():

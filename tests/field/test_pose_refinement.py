@@ -144,3 +144,38 @@ def test_training_moves_photos_and_goes_on_from_a_checkpoint_to_the_same_bytes()
         one, other = training.to_tensors(state), training.to_tensors(again)
         for name, value in one.items():
             np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def test_rays_to_known_points_move_with_their_photos():
+    images = ball_images(3)
+    seen = {}
+    for image in images:
+        towards = image.cam_from_world.target_origin_in_source()
+        p = np.random.default_rng(0).normal(size=(60, 3)) * 0.2 + towards / np.linalg.norm(towards)
+        seen[image.name] = SeenPoints(0.8 * p / np.linalg.norm(p, axis=1, keepdims=True), np.full(60, 0.01))
+    plan = FastPlan(finest=24, steps=(2,) * 8, num_chunks=2, samples_per_chunk=512, scout=False, refine_poses=True)
+    with ThreadPoolExecutor(1) as executor:
+        work = fast_training(images, FRAME, plan, seed=0, executor=executor, seen=seen, refine_poses=True)
+        saved = {name: array.copy() for name, array in work.to_tensors(work.start()).items()}
+        saved["moved"][1] = [0.0, 0.02, 0.0, 0.1, 0.0, 0.0]
+        state = work.from_tensors(saved)
+    assert len(state.known.image) > 0
+    np.testing.assert_array_equal(state.known.centers, state.rays.centers)
+    np.testing.assert_array_equal(state.known.rotations, state.rays.rotations)
+    moved = images[1].cam_from_world.retract(saved["moved"][1]).target_origin_in_source()
+    np.testing.assert_allclose(state.known.centers[1], moved, atol=1e-6)
+
+
+def test_a_lens_with_pixels_that_no_ray_reaches_is_compared_where_it_shows_something():
+    lens = Camera("OPENCV_FISHEYE", 64, 64, np.array([18.0, 18.0, 32.0, 32.0, -0.3, 0.0, 0.0, 0.0]))
+    image = ball_images(1)[0]
+    wide = PosedImage("wide", lens, image.cam_from_world, np.full((64, 64, 3), 200, np.uint8))
+    rays = rays_from_view(lens, wide.cam_from_world)
+    assert not np.isfinite(rays.directions).all()
+
+    def finite_only(rays):
+        assert np.isfinite(rays.directions).all()
+        return textured_ball(rays)
+
+    (photo,) = movable_photos((wide,), FRAME, None)
+    assert np.isfinite(refined((photo,), np.zeros((1, 6)), finite_only, np.ones((1, 3)), WHITE)).all()

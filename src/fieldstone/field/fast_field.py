@@ -186,6 +186,17 @@ def _vertices(layout: GridLayout, table: np.ndarray) -> list[np.ndarray]:
     return [layout.level(table, level).reshape(-1, CHANNELS) for level in range(layout.num_levels)]
 
 
+def clear_unreachable(field: FastField, *tables: Float[np.ndarray, "t"]) -> None:
+    """Set what no ray can reach to 0, in tables laid out like the field's: a checkpoint does not keep it."""
+    reachable, start = reachable_vertices(field), 0
+    for level in range(field.layout.num_levels):
+        size = int(np.prod(field.layout.sizes[level]))
+        for table in tables:
+            vertices = field.layout.level(table, level).reshape(-1, CHANNELS)
+            vertices[~reachable[start : start + size]] = 0.0
+        start += size
+
+
 def compress(
     field: FastField, table: Float[np.ndarray, "t"], reachable: Bool[np.ndarray, "v"]
 ) -> Float[np.ndarray, "k 4"]:

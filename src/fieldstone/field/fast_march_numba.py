@@ -126,6 +126,8 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
         t, t_end = cut_to_slab(oy, dy, zero, ey, t, t_end)
         t, t_end = cut_to_slab(oz, dz, zero, ez, t, t_end)
     light = one
+    if not dx * dx + dy * dy + dz * dz > zero:  # nan, outside of a lens: it would never leave the box
+        return n, light, 0
     t += jitter * march.step
     nx, ny, nz = at(box.cells, 0), at(box.cells, 1), at(box.cells, 2)
     per_cell = one / box.cell_size

@@ -9,7 +9,7 @@ last stage really took. What was done is what the plan says.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
@@ -35,6 +35,13 @@ COARSEST_LEVEL = 14
 
 MAX_FINEST = 384
 """Cells of the finest level along the longest side: 32 bytes each, dense, fit the memory of a laptop."""
+
+
+POSITIVE = (
+    "density_rate", "feature_rate", "decoder_rate", "final_rate", "decay", "step_cells", "min_weight", "min_light"
+)  # fmt: skip
+COUNTS = ("finest", "num_chunks", "samples_per_chunk")
+"""Settings that are at least 1."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class FastPlan:
     by then goes too."""
     clear_fog_from: int = len(STAGE_SHARES)
     """From this stage on, cells that are no denser than at the start are given up too."""
-    fine_decay: float = 0.01
+    fine_decay: float = 0.0
     """What the density of a vertex of the finest level gives up with every step, as a share of itself by rate; coarser
     levels give up less, the coarsest nothing. Fine levels then add to coarse ones only what photos insist on."""
     immediate_levels: int = 1
@@ -92,10 +99,16 @@ class FastPlan:
     """Where training stopped because the time was over, if the machine became slower than any correction foresaw."""
 
     def __post_init__(self) -> None:
-        if len(self.steps) != len(STAGE_SHARES) or min(self.steps) < 1:
+        if len(self.steps) != len(STAGE_SHARES) or any(type(n) is not int or n < 1 for n in self.steps):
             raise ValueError(f"a plan needs {len(STAGE_SHARES)} stages of at least one step, got {self.steps}")
-        if self.finest < 1:
-            raise ValueError(f"the finest level needs at least one cell, got {self.finest}")
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if setting.type == "float" and not (type(value) in (int, float) and np.isfinite(value)):
+                raise ValueError(f"{setting.name} must be a finite number, got {value!r}")
+            if setting.name in POSITIVE and not value > 0:
+                raise ValueError(f"{setting.name} must be greater than 0, got {value!r}")
+            if setting.type == "int" and (type(value) is not int or value < (setting.name in COUNTS)):
+                raise ValueError(f"{setting.name} must be a whole number, got {value!r}")
 
     @property
     def total_steps(self) -> int:
@@ -186,8 +199,10 @@ def first_plan(finest: int, budget_s: float, *, bounded: bool) -> FastPlan:
     room = max([1024, *(samples for from_s, samples in LARGE_BATCHES if budget_s >= from_s)])
     if bounded:
         if finest <= SMALL_FINEST:
-            return FastPlan(finest, steps, samples_per_chunk=room, final_rate=SMALL_FINAL_RATE, immediate_levels=0)
-        return FastPlan(finest, steps, samples_per_chunk=room)
+            return FastPlan(
+                finest, steps, samples_per_chunk=room, final_rate=SMALL_FINAL_RATE, immediate_levels=0, fine_decay=0.01
+            )
+        return FastPlan(finest, steps, samples_per_chunk=room, fine_decay=0.01)
     return FastPlan(
         finest, steps, samples_per_chunk=room, scout=False, raw_offset=-3.0, prune_density=0.01, min_weight=4e-3,
         clear_fog_from=4, emptiness=0.0, exposure_rate=0.005, point_weight=0.5, free_weight=0.01, clear_floaters_from=3,

@@ -37,6 +37,8 @@ class FastState:
     """Tangents from the given poses of the photos to the refined ones, in the world."""
     rays: RayTable
     """The table of rays from the refined poses; follows from `moved`."""
+    known: RayTable
+    """The rays to known points from the refined poses; follows from `moved`."""
     workspace: Workspace
     """Room for the next step; follows from the rest."""
 

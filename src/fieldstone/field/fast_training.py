@@ -22,6 +22,7 @@ from fieldstone.field.fast_field import (
     FOREVER,
     REFERENCE_CELLS,
     FastField,
+    clear_unreachable,
     compress,
     expand,
     field_from_tensors,
@@ -126,7 +127,7 @@ class FastTraining:
         velocity, exposure = np.zeros_like(table), unit_exposure(self.num_images)
         moved = np.zeros((self.num_images, 6))
         room = self._workspace(field, plan)
-        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, exposure, moved, self.rays, room)
+        return FastState(plan, 0, 0, rays, field, velocity, zeros, square, exposure, moved, self.rays, self.known, room)
 
     @property
     def num_images(self) -> int:
@@ -180,7 +181,7 @@ class FastTraining:
 
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
-                state.rays, int(starts[c]), int(state.chunk_rays[c]), self.known, self.points,
+                state.rays, int(starts[c]), int(state.chunk_rays[c]), state.known, self.points,
                 int(starts[c]) // RAYS_PER_KNOWN, int(num_known[c]), self.projection, gains, self.seed, background,
                 room.grid, room.box, room.march, FOREVER, terms, field.decoder, transposed, field.width,
                 room.chunks[c],
@@ -200,6 +201,9 @@ class FastTraining:
         plan = state.plan
         stage, into_stage = plan.place(state.step)
         if plan.prunes_at(state.step):
+            if self._cell_size(state.field) != state.field.occupancy.cell_size:
+                # Cells of another size may reach vertices that had been given up.
+                clear_unreachable(state.field, state.field.table, state.velocity)
             fog = FOG * math.exp(state.field.raw_offset) if stage >= plan.clear_fog_from else 0.0
             field = self._pruned(state.field, max(plan.prune_density, fog))
             if plan.clear_floaters_from <= stage and into_stage == 0 and len(self.places):
@@ -227,21 +231,24 @@ class FastTraining:
             moved = refined(self.movable, moved, render_rays, gains, self.frame.background)
         turned_deg = np.rad2deg(np.linalg.norm(moved[:, :3], axis=1))
         logger.info("poses refined: turned by %.4f deg in the median", np.median(turned_deg))
-        return replace(state, moved=moved, rays=self._rays_from(moved))
+        rays, known = self._rays_from(moved)
+        return replace(state, moved=moved, rays=rays, known=known)
 
-    def _rays_from(self, moved: Float[np.ndarray, "v 6"]) -> RayTable:
-        """The table of rays with the photos at refined poses; where it was made counts for which pixels are in it."""
+    def _rays_from(self, moved: Float[np.ndarray, "v 6"]) -> tuple[RayTable, RayTable]:
+        """All rays and those to known points, with the photos at refined poses; which pixels there are stays."""
         if not self.movable or not moved.any():
-            return self.rays
+            return self.rays, self.known
         images = moved_images([photo.image for photo in self.movable], moved)
         rotations, centers = poses_in_frame(images, self.frame)
-        return self.rays._replace(rotations=rotations, centers=centers)
+        rays, known = (t._replace(rotations=rotations, centers=centers) for t in (self.rays, self.known))
+        return rays, known
+
+    def _cell_size(self, field: FastField) -> float:
+        return min(float(field.layout.spacings[-1]) * CELL_VERTICES, field.occupancy.cell_size)
 
     def _pruned(self, field: FastField, density: float) -> FastField:
         """The field without the cells that are nowhere denser than `density`."""
-        spacing = float(field.layout.spacings[-1])
-        cell_size = min(spacing * CELL_VERTICES, field.occupancy.cell_size)
-        occupancy = field.occupancy.resampled(cell_size, field.layout.extent)
+        occupancy = field.occupancy.resampled(self._cell_size(field), field.layout.extent)
         cells = self._denser(field, occupancy, density)
         if not cells.any():
             return field
@@ -305,7 +312,7 @@ class FastTraining:
             exposure = Exposure(*(tensors[f"exposure_{name}"].copy() for name in Exposure._fields))
             moved = tensors["moved"].copy()
             return FastState(
-                plan, step, cursor, rays, field, velocity, mean, square, exposure, moved, self._rays_from(moved),
+                plan, step, cursor, rays, field, velocity, mean, square, exposure, moved, *self._rays_from(moved),
                 self._workspace(field, plan),
             )  # fmt: skip
         except (KeyError, ValueError, TypeError) as error:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, RenderedRays
@@ -22,7 +22,7 @@ from fieldstone.field.ray_dataset import PosedImage, SeenPoints, reduce_images
 from fieldstone.geometry.camera import Camera, image_from_cam_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import skew
-from fieldstone.scene.rays import rays_from_view
+from fieldstone.scene.rays import Rays, rays_from_view
 
 SIZE_PX = 112
 """Longer side of the pictures that are compared."""
@@ -148,14 +148,22 @@ def _compare(
     image = photo.image
     pose = image.cam_from_world.retract(tangent)
     rays = rays_from_view(image.camera, pose)
-    reached = np.isfinite(rays.directions).all(axis=1)
-    rendered = render_rays(rays)
+    reached = np.flatnonzero(np.isfinite(rays.directions).all(axis=1))
+    rendered = _rendered(render_rays, rays, reached)
     shown = rendered.rgb.astype(np.float64) * gain
-    usable = reached & _inside_surfaces(image.camera, rendered)
+    usable = _inside_surfaces(image.camera, rendered)
     if image.keep is not None:
         usable &= image.keep.reshape(-1)
     points = rays.origins + rays.directions * rendered.depth[:, None]
     return _Comparison(pose, rendered, shown, target - shown, usable, points)
+
+
+def _rendered(render_rays: RayRenderer, rays: Rays, rows: Int[np.ndarray, "k"]) -> RenderedRays:
+    """These rays; others, outside of a wide lens, show nothing."""
+    found = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
+    rgb, (depth, opacity) = np.zeros((len(rays), 3), np.float32), np.zeros((2, len(rays)), np.float32)
+    rgb[rows], depth[rows], opacity[rows] = found.rgb, found.depth, found.opacity
+    return RenderedRays(rgb, depth, opacity)
 
 
 def _inside_surfaces(camera: Camera, rendered: RenderedRays) -> Bool[np.ndarray, "p"]:

@@ -186,7 +186,7 @@ class TorchFastTraining:
         rays = room_for_rays(num_known + count)
         background = work.frame.background.astype(np.float32)
         gains = gains_of(host.exposure)
-        tables = ((work.known, host.cursor // RAYS_PER_KNOWN, num_known, work.seed + 1, 0),
+        tables = ((host.known, host.cursor // RAYS_PER_KNOWN, num_known, work.seed + 1, 0),
                   (host.rays, host.cursor, count, work.seed, num_known))  # fmt: skip
         for table, start, number, seed, at in tables:
             draw_rays(table, work.projection, gains, start, number, seed, background, rays, at)

@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from fieldstone.field.interrupts import deferred_interrupts
 from fieldstone.field.radiance_field import FieldTraining, StepReport
 
 logger = logging.getLogger(__name__)
@@ -113,17 +114,20 @@ def train(
     on_step: OnStep = lambda point: None,
     save: Callable[[S, tuple[CurvePoint, ...]], None] = lambda state, curve: None,
     save_every_s: float = 60.0,
+    show: Callable[[S], None] = lambda state: None,
+    show_every_s: float = 10.0,
     save_at_end: bool = True,
 ) -> tuple[S, tuple[CurvePoint, ...]]:
     """Step until the budget or the number of steps is used up; `save` is called now and then, and at the end.
 
-    An interruption saves too.
+    An interruption saves too, after the step that it came in.
 
     Args:
         state: Where to start; after a stop, what the checkpoint holds.
         budget_s: Seconds of training in all, those of `curve` included; None: no limit.
         max_steps: Steps in all, those of `curve` included; None: no limit.
         curve: The steps done before.
+        show: Is called now and then, for a picture of what there is.
         save_at_end: False leaves the last state to the caller, who goes on with it.
 
     Returns:
@@ -136,24 +140,29 @@ def train(
         raise ValueError("training needs a budget in seconds or a number of steps")
     points = list(curve)
     before = points[-1].seconds if points else 0.0
-    start = last_save = time.perf_counter()
+    start = last_save = last_show = time.perf_counter()
     paused = 0.0
-    try:
-        while (max_steps is None or len(points) < max_steps) and (
-            budget_s is None or not points or points[-1].seconds < budget_s
-        ):
-            state, report = training.step(state)
-            now = time.perf_counter()
-            points.append(_curve_point(len(points) + 1, before + now - start - paused, report))
-            on_step(points[-1])
-            if now - last_save > save_every_s:
-                save(state, tuple(points))
-                last_save = time.perf_counter()
-                paused += last_save - now
-    except KeyboardInterrupt:
-        logger.warning("interrupted after %d steps; they are kept", len(points))
-        save(state, tuple(points))
-        raise
+    with deferred_interrupts() as check:
+        try:
+            while (max_steps is None or len(points) < max_steps) and (
+                budget_s is None or not points or points[-1].seconds < budget_s
+            ):
+                state, report = training.step(state)
+                now = time.perf_counter()
+                points.append(_curve_point(len(points) + 1, before + now - start - paused, report))
+                on_step(points[-1])
+                if now - last_show > show_every_s:
+                    show(state)
+                    last_show = time.perf_counter()
+                if now - last_save > save_every_s:
+                    save(state, tuple(points))
+                    last_save = time.perf_counter()
+                    paused += last_save - now
+                check()
+        except KeyboardInterrupt:
+            logger.warning("interrupted after %d steps; they are kept", len(points))
+            save(state, tuple(points))
+            raise
     if save_at_end:
         save(state, tuple(points))
     return state, tuple(points)

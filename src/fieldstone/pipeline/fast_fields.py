@@ -13,18 +13,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
-from fieldstone.field.fast_exposure import Exposure, gain_at
+from fieldstone.field.fast_exposure import gain_at
 from fieldstone.field.fast_plan import (
     STAGE_SHARES,
     FastPlan,
-    corrected,
     finest_for,
     first_plan,
     plan_for_budget,
@@ -33,13 +32,14 @@ from fieldstone.field.fast_plan import (
 from fieldstone.field.fast_training import FastTraining, fast_training
 from fieldstone.field.radiance_field import FieldFrame, FieldTraining, in_world
 from fieldstone.field.ray_dataset import PosedImage, RayDataset, reduce_image
-from fieldstone.field.training import CurvePoint, OnStep, train
+from fieldstone.field.training import CurvePoint, OnStep
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.photos import write_photo
+from fieldstone.pipeline.fast_stages import PlannedState, measured_step, train_stages
 from fieldstone.pipeline.field_input import dataset_of, holding_out, open_field_input, read_images, with_masks
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
@@ -60,43 +60,13 @@ logger = logging.getLogger(__name__)
 PLAN, PREVIEW = "plan.json", "preview.png"
 
 PREVIEW_SIZE_PX = 200
-"""The first training view is shown at this size after every stage."""
+"""The first training view is shown at this size now and then."""
 
 MAX_SIZE_PX = 4096
 """Photos are reduced to this length of their longer side."""
 
-MEASURED_STEPS = 12
-"""Steps that are tried, and thrown away, to learn how fast the machine is."""
-
 TIME_KEPT = 0.97
 """Share of the budget that is planned for: the last steps and the last checkpoint take what they take."""
-
-
-P = TypeVar("P", bound="PlannedState")
-
-
-@runtime_checkable
-class PlannedState(Protocol):
-    """A state of a training that follows a plan, on whatever device."""
-
-    @property
-    def plan(self) -> FastPlan:
-        """What is followed."""
-        ...
-
-    @property
-    def step(self) -> int:
-        """Steps done."""
-        ...
-
-    @property
-    def exposure(self) -> Exposure:
-        """Of every photo."""
-        ...
-
-    def with_plan(self: P, plan: FastPlan) -> P:
-        """The same state, with other steps to come."""
-        ...
 
 
 StepsBy = Callable[[FastTraining], FieldTraining[Any]]
@@ -152,7 +122,7 @@ def train_fast_run(
     if not budget_s > 0:
         raise InputError(f"a budget must be positive, got {budget_s:g} s; say for example --budget 60s")
     threads = threads or os.cpu_count() or 1
-    given = None if plan is None else _read_plan(plan)
+    given = followed_plan(out, None if plan is None else _read_plan(plan))
     steps_by = steps_on(device)
     with ThreadPoolExecutor(threads) as executor:
         on_stage("compiling")
@@ -163,13 +133,13 @@ def train_fast_run(
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         opened = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
-        resumed = (out / CHECKPOINT).exists()
-        if given is None and not resumed:
+        if given is None:
             spent = time.perf_counter() - started
             seconds_per_step = measured_step(steps_by(opened))
             opened = replace(opened, plan=plan_for_budget(opened.plan, TIME_KEPT * budget_s, spent, seconds_per_step))
         training = steps_by(opened)
         state, curve = resume_or_start(training, out, header)
+        trained_before = curve[-1].seconds if curve else 0.0
         views = scene_tensors(dataset.train)
 
         def save(state: PlannedState, curve: tuple[CurvePoint, ...]) -> None:
@@ -183,7 +153,7 @@ def train_fast_run(
             write_photo(out / PREVIEW, quantize(view.rgb))
 
         on_stage("training")
-        deadline = None if given is not None or resumed else started + TIME_KEPT * budget_s
+        deadline = None if given is not None else started + TIME_KEPT * budget_s
         state, curve = train_stages(
             training, state, curve, deadline=deadline, max_steps=max_steps, on_step=on_step, save=save, preview=preview
         )
@@ -193,7 +163,7 @@ def train_fast_run(
         shown = in_world(training.renderer(state), dataset.frame)
         metrics = evaluate_views(shown, dataset, out / "renders" / "test", exposure_near(dataset, state))
     metrics |= {
-        "seconds": elapsed,
+        "seconds": elapsed + trained_before,
         "steps": state.step,
         "field": "fast",
         "alpha": use_alpha,
@@ -231,61 +201,6 @@ def exposure_near(dataset: RayDataset, state: PlannedState) -> Callable[[PosedIm
     log_gain = state.exposure.log_gain.astype(np.float64).reshape(-1, 3)
     poses = Rigid3.stack([image.cam_from_world for image in dataset.train])
     return lambda image: gain_at(log_gain, image.cam_from_world, poses)
-
-
-def train_stages(
-    training: FieldTraining[P],
-    state: P,
-    curve: tuple[CurvePoint, ...],
-    *,
-    deadline: float | None,
-    max_steps: int | None,
-    on_step: OnStep,
-    save: Callable[[P, tuple[CurvePoint, ...]], None],
-    preview: Callable[[P], None] = lambda state: None,
-) -> tuple[P, tuple[CurvePoint, ...]]:
-    """Follow the plan of a state to its end, stage by stage.
-
-    Args:
-        deadline: At the start of each stage, the steps to come are set to what fits until this time of
-            `time.perf_counter`, and there training ends; None: the plan stands.
-    """
-    while state.step < min(state.plan.total_steps, max_steps or state.plan.total_steps):
-        plan = state.plan
-        stage = plan.stage_of(state.step)
-        end = sum(plan.steps[: stage + 1])
-        last = min(end, plan.total_steps, max_steps or end)
-        before, began = state.step, time.perf_counter()
-        left = None if deadline is None else deadline - began + (curve[-1].seconds if curve else 0.0)
-
-        state, curve = train(
-            training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=save, save_at_end=False
-        )
-        preview(state)
-        now = time.perf_counter()
-        if state.step < last:
-            state = state.with_plan(replace(state.plan, stop_after=state.step))
-            logger.warning("the time is over after %d of %d steps", state.step, sum(plan.steps))
-        elif deadline is not None and stage + 1 < len(plan.steps) and last == end:
-            slower = 1.4 if plan.levels(stage + 1) != plan.levels(stage) else 1.0
-            per_step = slower * (now - began) / (state.step - before)
-            state = state.with_plan(corrected(plan, stage + 1, deadline - now, per_step))
-            logger.info(
-                "stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, now - began, state.plan.steps
-            )
-    save(state, curve)
-    return state, curve
-
-
-def measured_step(training: FieldTraining[Any]) -> float:
-    """Seconds of a first step on this machine, by trying some."""
-    state = training.start()
-    times = []
-    for _ in range(MEASURED_STEPS):
-        began = time.perf_counter()
-        state, _ = training.step(state)
-        times.append(time.perf_counter() - began)
-    return float(np.median(times[2:]))
 
 
 def compile_kernels(executor: Executor, steps_by: StepsBy = lambda training: training) -> None:
@@ -377,6 +292,20 @@ BYTES_PER_VERTEX, MIN_FINEST = 48, 16
 
 MAX_UNBOUNDED = 256
 """As `fast_plan.MAX_FINEST`, for a box of which nearly all cells may be used."""
+
+
+def followed_plan(out: Path, given: FastPlan | None) -> FastPlan | None:
+    """The plan that is followed to the letter: of the run that `out` holds, else the given one, if there is one.
+
+    Raises:
+        InputError: The given plan is not that of the run in `out`.
+    """
+    if not (out / CHECKPOINT).exists() or not (out / PLAN).exists():
+        return given
+    stored = _read_plan(out / PLAN)
+    if given is not None and replace(given, stop_after=None) != replace(stored, stop_after=None):
+        raise InputError(f"{out}: holds a run of another plan than --plan; leave it out, or choose another folder")
+    return stored
 
 
 def _read_plan(path: Path) -> FastPlan:
