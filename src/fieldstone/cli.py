@@ -192,6 +192,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         sys.stderr.write(f"fieldstone: {error}\n")
         return 3
+    except MemoryError:
+        sys.stderr.write("fieldstone: out of memory; use fewer or smaller photos, or close other programs\n")
+        return 5
     except OSError as error:
         sys.stderr.write(
             f"fieldstone: {error.filename or 'disk'}: {error.strerror or error}; free space or choose another output\n"

@@ -51,7 +51,8 @@ def train(
         out: Folder for the result: checkpoint.safetensors, metrics.json, curve.json, renders/test.
         field: fast needs seconds to minutes and no torch; tiny is the small network of the course at 100x100, nerf the
             original NeRF at 400x400.
-        budget: Time for reading and training in all, what earlier runs in this folder took included: 60s, 10m, 2h.
+        budget: Time for reading and training: 60s, 10m, 2h. A run that goes on after a stop follows the plan that it
+            began with; for the classical networks, the time is that of all runs in this folder.
         quality: The budget, where none is given: draft 20s, normal 60s, high 5m.
         memory: GiB that grids and rays may take (fast only).
         steps: Stop after so many steps in all, if the budget lasts.
@@ -60,7 +61,8 @@ def train(
         photos: Folder with the photos of a reconstruction, if they are not where they were.
         masks: Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. Nothing is learned where
             they are black, nor measured; by default those of the reconstruction (fast only).
-        size: Photos are reduced to this length of their longer side, in pixels (fast only).
+        size: Photos are reduced to this length of their longer side, in pixels; by default to what --memory holds
+            (fast only).
         refine_poses: Move the training photos a little, so that the field fits them; known points of a reconstruction
             hold them (fast only).
         hold_out: Photos to measure with, by name, with commas between: a.jpg,b.jpg; none learns from all of them. By
@@ -105,8 +107,6 @@ def train(
             "on_stage": lambda stage: progress.update(task, description=stage),
         }
         if field == "fast":
-            if size is not None:
-                shared["size_px"] = size
             metrics = train_fast_run(
                 source,
                 out,
@@ -114,6 +114,7 @@ def train(
                 use_alpha=alpha,
                 memory_gib=memory,
                 masks=masks,
+                size_px=size,
                 refine_poses=refine_poses,
                 **shared,
             )
@@ -157,7 +158,7 @@ def render(
         frames: Number of images; by default 120, or one for each pose of dataset and files.
         fps: Images per second.
         size: Longer side in pixels; by default as trained.
-        device: cpu, cuda, mps.
+        device: cpu, cuda, mps, for the classical networks; the fast field is rendered on the CPU.
         threads: 0 takes all cores.
     """
     from rich.progress import Progress

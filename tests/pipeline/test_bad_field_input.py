@@ -116,6 +116,30 @@ def test_a_full_disk_at_checkpoint_time_is_one_line(tmp_path, monkeypatch, capsy
     assert error.count("\n") == 1
 
 
+def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
+    def too_much(*arguments, **options):
+        raise MemoryError
+
+    monkeypatch.setattr(fast_fields, "fast_training", too_much)
+    monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
+    folder = write_scene(tmp_path)
+    assert main(["train", str(folder), "-o", str(folder / "out"), "--threads", "1"]) == 5
+    error = capsys.readouterr().err
+    assert "out of memory" in error
+    assert error.count("\n") == 1
+
+
+def test_a_held_out_photo_of_another_size_is_found_before_training(tmp_path, monkeypatch):
+    folder = write_scene(tmp_path)
+    monkeypatch.setattr(fast_fields, "fast_training", lambda *arguments, **options: pytest.fail("began to train"))
+    monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
+    scene = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps({**scene, "w": 40, "h": 32}))
+    write_photo(folder / "r_8.png", np.zeros((50, 60, 4), np.uint8))
+    with pytest.raises(InputError, match="60x50"):
+        train(folder)
+
+
 def test_a_checkpoint_of_another_kind_is_refused(tmp_path):
     folder = write_scene(tmp_path)
     (folder / "out").mkdir()

@@ -1,5 +1,6 @@
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,11 +8,16 @@ import pytest
 from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.io.photos import write_photo
+from fieldstone.io.posed_photos import PosedPhoto
 from fieldstone.pipeline import fast_fields
-from fieldstone.pipeline.fast_fields import train_fast_run
+from fieldstone.pipeline.fast_fields import size_in_memory, train_fast_run
 from fieldstone.pipeline.fields import split_tensors
+
+CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 1500.0]))
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +84,39 @@ def test_the_same_plan_gives_the_same_bytes_however_interrupted(ball_folder, tmp
     assert checkpoint_bytes(tmp_path / "a") == checkpoint_bytes(tmp_path / "b")
 
 
+def test_a_run_goes_on_by_its_own_plan(ball_folder, tmp_path):
+    plan = write_plan(tmp_path / "plan.json")
+    out = tmp_path / "out"
+    train_fast_run(ball_folder, out, plan=plan, max_steps=7, threads=1)
+    other = write_plan(tmp_path / "other.json", steps=6)
+    with pytest.raises(InputError, match="another plan"):
+        train_fast_run(ball_folder, out, plan=other, threads=1)
+    metrics = train_fast_run(ball_folder, out, budget_s=0.01, threads=1)
+    assert metrics["steps"] == 40
+    assert metrics["plan"]["stop_after"] is None
+    assert metrics["seconds"] > json.loads((out / "curve.json").read_text())[6]["seconds"]
+    train_fast_run(ball_folder, tmp_path / "whole", plan=plan, threads=1)
+    assert checkpoint_bytes(out) == checkpoint_bytes(tmp_path / "whole")
+
+
+def test_refined_poses_stay_refined_when_a_run_goes_on(ball_folder, tmp_path):
+    plan = write_plan(tmp_path / "plan.json")
+    settings = json.loads(plan.read_text())
+    plan.write_text(json.dumps({**settings, "refine_poses": True}))
+    train_fast_run(ball_folder, tmp_path / "whole", plan=plan, threads=1)
+    train_fast_run(ball_folder, tmp_path / "out", plan=plan, max_steps=22, threads=1)
+    train_fast_run(ball_folder, tmp_path / "out", threads=1)
+    assert checkpoint_bytes(tmp_path / "out") == checkpoint_bytes(tmp_path / "whole")
+
+
+def test_photos_are_as_large_as_memory_allows():
+    photos = [PosedPhoto(f"{k}.jpg", Path(f"{k}.jpg"), CAMERA_12_MP, Rigid3(np.eye(3), np.zeros(3))) for k in range(20)]
+    size = size_in_memory(photos, 4.0)
+    assert 36 * 20 * size * (0.75 * size) == pytest.approx(0.75 * 4 * 2**30, rel=1e-2)
+    assert size_in_memory(photos[:1], 4.0) == 4000
+    assert size_in_memory(photos, 1e-6) == 200
+
+
 def test_train_and_render_as_typed(ball_folder, tmp_path, capsys):
     out = tmp_path / "out"
     plan = write_plan(tmp_path / "plan.json")
@@ -86,8 +125,9 @@ def test_train_and_render_as_typed(ball_folder, tmp_path, capsys):
     whole = ["train", str(ball_folder), "-o", str(tmp_path / "whole"), "--plan", str(plan), "--hold-out", "none"]
     assert main([*whole, "--threads", "1"]) == 0
     assert "no photo was held out" in capsys.readouterr().out
-    assert main(["render", str(out), "--format", "png", "--frames", "2", "--threads", "1"]) == 0
-    assert (out / "renders" / "orbit" / "0001.png").is_file()
+    for frames in (3, 2):
+        assert main(["render", str(out), "--format", "png", "--frames", str(frames), "--threads", "1"]) == 0
+    assert sorted(path.name for path in (out / "renders" / "orbit").iterdir()) == ["0000.png", "0001.png"]
     given = tmp_path / "orbit.json"
     given.write_text(json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]}))
     assert main(["render", str(out), "--format", "png", "--path", str(given), "--threads", "1"]) == 0

@@ -39,8 +39,16 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.atomic import write_json, write_text
 from fieldstone.io.checkpoint import write_checkpoint
 from fieldstone.io.photos import write_photo
+from fieldstone.io.posed_photos import PosedPhoto
 from fieldstone.pipeline.fast_stages import PlannedState, measured_step, train_stages
-from fieldstone.pipeline.field_input import dataset_of, holding_out, open_field_input, read_images, with_masks
+from fieldstone.pipeline.field_input import (
+    check_sizes,
+    dataset_of,
+    holding_out,
+    open_field_input,
+    read_images,
+    with_masks,
+)
 from fieldstone.pipeline.fields import (
     CHECKPOINT,
     CURVE,
@@ -86,7 +94,7 @@ def train_fast_run(
     threads: int | None = None,
     photos: Path | None = None,
     masks: Path | None = None,
-    size_px: int = MAX_SIZE_PX,
+    size_px: int | None = None,
     refine_poses: bool = False,
     hold_out: Sequence[str] | None = None,
     device: str = "cpu",
@@ -107,7 +115,7 @@ def train_fast_run(
         memory_gib: What grids and rays may take; the finest grid is chosen to fit.
         masks: Folder with masks of the photos; nothing is learned where they are black, nor measured. None: those of
             the reconstruction, if it had some.
-        size_px: Photos are reduced to this length of their longer side.
+        size_px: Photos are reduced to this length of their longer side; None: to what fits, see `size_in_memory`.
         refine_poses: Move the training photos so that the field fits them, held by known points. Held-out photos stay.
         hold_out: Photos to measure with instead of the default, see `field_input.holding_out`.
         device: Where steps are computed: cpu, or a device of torch, see `torch_fast_training`. Equal plans then give
@@ -130,6 +138,8 @@ def train_fast_run(
         started = time.perf_counter()
         on_stage("reading photos")
         given_photos = with_masks(holding_out(open_field_input(source, photos), hold_out), masks, source)
+        size_px = size_px or size_in_memory(given_photos.train, memory_gib)
+        check_sizes(given_photos.test)
         dataset = dataset_of(given_photos, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         opened = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
@@ -261,13 +271,25 @@ def _open(
     finest = finest_for(budget_s, extent, pixel_size)
     if training.unbounded:
         finest = min(2 * finest, MAX_UNBOUNDED)
-    finest = min(finest, _finest_in_memory(training, memory_gib))
+    finest = min(finest, _finest_in_memory(training, dataset.train, memory_gib))
     plan = first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
     return replace(training, plan=replace(plan, refine_poses=refine_poses))
 
 
-def _finest_in_memory(training: FastTraining, memory_gib: float) -> int:
-    """Cells along the longest side whose grids fit beside the rays.
+def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
+    """Pixels along the longer side of the photos whose rays leave room for grids."""
+    cameras = [photo.camera for photo in photos]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    share = RAYS_SHARE * memory_gib * 2**30 / (BYTES_PER_PIXEL * max(pixels, 1))
+    longest = max((max(camera.width, camera.height) for camera in cameras), default=MAX_SIZE_PX)
+    size = min(MAX_SIZE_PX, longest, max(int(longest * min(share, 1.0) ** 0.5), PREVIEW_SIZE_PX))
+    if size < longest:
+        logger.info("photos are reduced to %d pixels, so that rays and grids fit %g GiB", size, memory_gib)
+    return size
+
+
+def _finest_in_memory(training: FastTraining, images: Sequence[PosedImage], memory_gib: float) -> int:
+    """Cells along the longest side whose grids fit beside the photos and their rays.
 
     A vertex of the finest level has 32 bytes of values and velocities, all coarser levels add a seventh and their
     gradients; growing by a level needs the old values once more.
@@ -276,7 +298,8 @@ def _finest_in_memory(training: FastTraining, memory_gib: float) -> int:
         InputError: Not even the coarsest grids fit.
     """
     rays = training.rays
-    used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings))
+    used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings, rays.free))
+    used += sum(image.pixels.nbytes for image in images)
     left = memory_gib * 2**30 - used
     extent = training.occupancy.extent / np.max(training.occupancy.extent)
     finest = int(np.cbrt(max(left, 0.0) / (BYTES_PER_VERTEX * np.prod(extent))))
@@ -289,6 +312,9 @@ def _finest_in_memory(training: FastTraining, memory_gib: float) -> int:
 
 
 BYTES_PER_VERTEX, MIN_FINEST = 48, 16
+
+BYTES_PER_PIXEL, RAYS_SHARE = 36, 0.75
+"""Bytes that a pixel and its ray take while the table of rays is made, and the share of the memory for them."""
 
 MAX_UNBOUNDED = 256
 """As `fast_plan.MAX_FINEST`, for a box of which nearly all cells may be used."""

@@ -33,7 +33,7 @@ from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender
 from fieldstone.io.colmap import find_colmap_model, read_colmap
 from fieldstone.io.llff import is_llff_folder, read_llff
 from fieldstone.io.masks import find_masks, read_mask
-from fieldstone.io.photos import read_photo
+from fieldstone.io.photos import read_photo, read_photo_info
 from fieldstone.io.posed_photos import PosedPhoto, PosedScene
 from fieldstone.io.transforms_json import find_transforms, read_transforms
 from fieldstone.render.camera_paths import focus_point
@@ -220,6 +220,25 @@ def read_images(
         if min(image.pixels.shape[:2]) < MIN_SIDE_PX:
             raise InputError(f"{image.name}: smaller than {MIN_SIDE_PX} pixels after reduction; use larger photos")
     return reduced
+
+
+def check_sizes(photos: Sequence[PosedPhoto]) -> None:
+    """Compare photos with their cameras by what their headers say; those that cannot be read are for later.
+
+    Raises:
+        InputError: A photo does not have the size of its camera.
+    """
+    for photo in photos:
+        try:
+            info = read_photo_info(photo.path)
+        except InputError:
+            continue
+        camera = photo.camera
+        if (info.width, info.height) != (camera.width, camera.height):
+            raise InputError(
+                f"{photo.path}: {info.width}x{info.height} pixels, but its camera has {camera.width}x{camera.height}; "
+                "use the photos that were posed"
+            )
 
 
 def view_labels(names: Sequence[str]) -> list[str]:

@@ -96,6 +96,8 @@ def render_run(
         elif fmt == "gif":
             write_gif(target, images(), fps=fps)
         else:
+            for stale in target.glob("[0-9][0-9][0-9][0-9].png"):
+                stale.unlink()
             for k, image in enumerate(images()):
                 write_photo(target / f"{k:04d}.png", image)
     return target
