@@ -12,6 +12,7 @@ from fieldstone.render.views import (
     normal_image,
     progressive_views,
     render_view,
+    surface_depth,
 )
 
 
@@ -120,3 +121,10 @@ def test_confidence_counts_the_photos_that_see_a_point_from_the_same_side():
     found = confidence_image(view, camera, here, [(camera, here), (camera, half)])[:, :, 0]
     np.testing.assert_allclose(found[:, :4], 0.0)
     np.testing.assert_allclose(found[:, 4:], 0.4)
+
+
+def test_the_surface_is_where_the_light_that_ends_has_ended():
+    """A sheet at 3 that stops 80 % of the light before a background at 50; through another, most of it passes."""
+    opacity = np.array([[0.8, 0.3, 1.0]])
+    view = RenderedView(np.zeros((1, 3, 3)), opacity * 3.0 + (1 - opacity) * 50.0, opacity)
+    np.testing.assert_allclose(surface_depth(view, 50.0), [[3.0, np.inf, 3.0]])

@@ -1,16 +1,19 @@
-"""A trained fast field to a coloured mesh, and how well the mesh agrees with the field."""
+"""A trained fast field to a coloured mesh, and how well the mesh agrees with the field.
+
+The density says what is solid and what is a floater; the depths that it shows to the photos say where the surface is.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
@@ -23,9 +26,10 @@ from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.io.meshes import write_mesh
 from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
 from fieldstone.render.camera_paths import up_direction
+from fieldstone.render.depth_fusion import fused
 from fieldstone.render.meshing import cleaned, colored, solidity, surface
 from fieldstone.render.rasterize_numba import mesh_depth
-from fieldstone.render.views import render_view
+from fieldstone.render.views import render_view, surface_depth
 from fieldstone.scene.mesh import Mesh
 from fieldstone.scene.rays import rays_from_view
 
@@ -39,6 +43,15 @@ LENGTH_CELLS = 2.0
 
 MAX_DEPTH_SHARE = 0.97
 """In a projective space, what lies nearer to infinity has no surface."""
+
+FUSED_VIEWS, FUSED_SIZE_PX = 48, 400
+"""How many photos' views, at which size, say where the surface lies."""
+
+SURFACE = 0.5
+"""Value on the surface of `depth_fusion.fused`."""
+
+COLOR_CELLS = 0.25
+"""How far behind the surface colours are taken, in cells of the finest level: before it there is nothing."""
 
 COMPARED_VIEWS, COMPARED_SIZE_PX = 8, 200
 """How many photos' views, at which size, the mesh is compared with its field in."""
@@ -70,21 +83,21 @@ def mesh_run(
     """
     field, frame, poses, header = solid_field(out, "a mesh", cells, level)
     on_stage("extracting the surface")
-    mesh, floaters = normalized_mesh(field, frame, poses, cells, level)
-    world = frame.normalized_from_world.inverse()
-    mesh = Mesh(world.apply(mesh.vertices), mesh.faces, mesh.colors)
-    path = out / f"mesh.{fmt}"
-    write_mesh(_upright(mesh, poses) if fmt == "glb" else mesh, path)
-    on_stage("comparing it with the field")
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         render_rays = in_world(renderer(field, frame, executor), frame)
+        mesh, floaters = normalized_mesh(field, frame, poses, header, render_rays, cells, level)
+        world = frame.normalized_from_world.inverse()
+        mesh = Mesh(world.apply(mesh.vertices), mesh.faces, mesh.colors)
+        path = out / f"mesh.{fmt}"
+        write_mesh(_upright(mesh, poses) if fmt == "glb" else mesh, path)
+        on_stage("comparing it with the field")
         record = {
             "path": path.name,
             "vertices": len(mesh.vertices),
             "faces": len(mesh.faces),
             "floaters_removed": floaters,
             "closed": mesh.is_closed(),
-            **agreement(mesh, render_rays, header, poses),
+            **agreement(mesh, render_rays, header, poses, frame.far / frame.normalized_from_world.scale),
         }
     write_json(out / MESH, record)
     return record
@@ -116,12 +129,21 @@ def solid_field(
 
 
 def normalized_mesh(
-    field: FastField, frame: FieldFrame, poses: Rigid3, cells: int | None, level: float
+    field: FastField,
+    frame: FieldFrame,
+    poses: Rigid3,
+    header: Mapping[str, Any],
+    render_rays: RayRenderer,
+    cells: int | None,
+    level: float,
 ) -> tuple[Mesh, int]:
     """The coloured mesh of a field in normalised coordinates, and the number of floaters removed.
 
     Marching cubes runs in the space of the grids; vertices then leave a projective space, where there is one. Of an
     unbounded scene, what lies beyond the box is left out.
+
+    Args:
+        render_rays: The field, in the world.
     """
     open_scene = field.unbounded or field.projection.active
     lower, upper = field.occupancy.lower, field.occupancy.lower + field.layout.extent
@@ -134,11 +156,23 @@ def normalized_mesh(
     if cells is not None:
         spacing = float(np.max(upper - lower)) / cells
     share, floaters = cleaned(solidity(field.density, lower, upper, spacing, LENGTH_CELLS * finest), level)
-    mesh = surface(share, level, lower, spacing, closed=not open_scene)
+    world = frame.normalized_from_world.inverse()
+
+    def position(index: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        points = lower + spacing * index
+        return world.apply(unproject_points(field.projection, points) if field.projection.active else points)
+
+    def views() -> Iterator[tuple[Camera, Rigid3, Float[np.ndarray, "h w"]]]:
+        for camera, pose in compared_views(header, poses, FUSED_VIEWS, FUSED_SIZE_PX, enlarge=True):
+            yield camera, pose, surface_depth(render_view(render_rays, camera, pose), frame.far * world.scale)
+
+    share, more = cleaned(fused(share, level, position, views()), SURFACE)
+    floaters += more
+    mesh = surface(share, SURFACE, lower, spacing, closed=not open_scene)
     logger.info("surface of %d faces, %d floaters removed", len(mesh.faces), floaters)
     centers = frame.normalized_from_world.apply(poses.target_origin_in_source())
     if not field.projection.active:
-        return colored(mesh, field.color, centers, 0.5 * finest), floaters
+        return colored(mesh, field.color, centers, COLOR_CELLS * finest), floaters
 
     def color(points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return field.color(np.clip(project_points(field.projection, points), lower, upper - 1e-6), directions)
@@ -147,8 +181,14 @@ def normalized_mesh(
     return colored(mesh, color, centers, 0.0), floaters
 
 
-def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], poses: Rigid3) -> dict[str, Any]:
-    """Silhouettes (intersection over union) and depths of the mesh against those of the field, in views of photos."""
+def agreement(
+    mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], poses: Rigid3, far: float
+) -> dict[str, Any]:
+    """Silhouettes (intersection over union) and depths of the mesh against those of the field, in views of photos.
+
+    Args:
+        far: Where light that passes ends, in the world.
+    """
     overlap, union, depths, views = 0, 0, [], compared_views(header, poses, COMPARED_VIEWS, COMPARED_SIZE_PX)
     for camera, pose in views:
         seen = render_view(render_rays, camera, pose)
@@ -157,7 +197,7 @@ def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], p
         overlap += int(np.count_nonzero(solid & of_mesh))
         union += int(np.count_nonzero(solid | of_mesh))
         along_z = rays_from_view(camera, pose).directions @ pose.R[2]
-        field_depth = seen.depth * along_z.reshape(depth.shape)
+        field_depth = surface_depth(seen, far) * along_z.reshape(depth.shape)
         both = of_mesh & (seen.opacity > 0.95)
         depths.append(np.abs(depth[both] / field_depth[both] - 1.0))
     errors = np.concatenate(depths) if depths else np.empty(0)
@@ -169,13 +209,20 @@ def agreement(mesh: Mesh, render_rays: RayRenderer, header: Mapping[str, Any], p
     }
 
 
-def compared_views(header: Mapping[str, Any], poses: Rigid3, count: int, size_px: int) -> list[tuple[Camera, Rigid3]]:
-    """Cameras at the poses of some training photos, their longer sides at most `size_px`."""
+def compared_views(
+    header: Mapping[str, Any], poses: Rigid3, count: int, size_px: int, *, enlarge: bool = False
+) -> list[tuple[Camera, Rigid3]]:
+    """Cameras at the poses of some training photos, their longer sides at most `size_px`.
+
+    Args:
+        enlarge: Exactly `size_px`, also if the photos are smaller.
+    """
     found = []
     for v in np.unique(np.linspace(0, len(poses.t) - 1, count).astype(np.int64)).tolist():
         c = header["cameras"][header["camera_of_view"][v]]
         camera = Camera(c["model"], c["width"], c["height"], np.array(c["params"]))
-        factor = min(size_px / max(camera.width, camera.height), 1.0)
+        factor = size_px / max(camera.width, camera.height)
+        factor = factor if enlarge else min(factor, 1.0)
         size = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
         found.append((rescale(camera, *size), poses[v]))
     return found

@@ -21,7 +21,7 @@ from fieldstone.field.radiance_field import FieldFrame, in_world
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.atomic import write_json
 from fieldstone.io.splats import write_splats
-from fieldstone.pipeline.field_mesh import compared_views, normalized_mesh, solid_field
+from fieldstone.pipeline.field_mesh import COLOR_CELLS, compared_views, normalized_mesh, solid_field
 from fieldstone.render.splat_view_numba import splat_view
 from fieldstone.render.splatting import splats_of_surface
 from fieldstone.render.views import render_view
@@ -58,11 +58,13 @@ def splat_run(
     """
     field, frame, poses, header = solid_field(out, "a file of splats", cells, level)
     on_stage("extracting the surface")
-    splats = splats_of_field(field, frame, poses, cells, level)
-    write_splats(splats, out / SPLATS)
-    on_stage("comparing it with the field")
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         render_rays = in_world(renderer(field, frame, executor), frame)
+        mesh, floaters = normalized_mesh(field, frame, poses, header, render_rays, cells, level)
+        splats = splats_of_mesh(mesh, field, frame, poses)
+        logger.info("%d splats, %d floaters removed", len(splats), floaters)
+        write_splats(splats, out / SPLATS)
+        on_stage("comparing it with the field")
         found, about = [], "no view without lens distortion to compare with"
         for camera, pose in compared_views(header, poses, COMPARED_VIEWS, COMPARED_SIZE_PX):
             if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
@@ -84,9 +86,12 @@ def splat_run(
     return record
 
 
-def splats_of_field(field: FastField, frame: FieldFrame, poses: Rigid3, cells: int | None, level: float) -> Splats:
-    """The splats of the surface of a field, in the world of the photos."""
-    mesh, floaters = normalized_mesh(field, frame, poses, cells, level)
+def splats_of_mesh(mesh: Mesh, field: FastField, frame: FieldFrame, poses: Rigid3) -> Splats:
+    """The splats of the surface of a field, in the world of the photos.
+
+    Args:
+        mesh: The surface, in normalised coordinates.
+    """
     world = frame.normalized_from_world
     back = world.inverse()
     finest = float(field.layout.spacings[-1])
@@ -102,7 +107,5 @@ def splats_of_field(field: FastField, frame: FieldFrame, poses: Rigid3, cells: i
         features = interpolate_numba(grid, np.ascontiguousarray(local, dtype=np.float32)).astype(np.float64)
         return lambda directions: decode(field.decoder, features, directions @ world.R.T)
 
-    depth = 0.0 if field.projection.active else 0.5 * finest / world.scale
-    splats = splats_of_surface(mesh, colors_from, poses.target_origin_in_source(), depth)
-    logger.info("%d splats, %d floaters removed", len(splats), floaters)
-    return splats
+    depth = 0.0 if field.projection.active else COLOR_CELLS * finest / world.scale
+    return splats_of_surface(mesh, colors_from, poses.target_origin_in_source(), depth)

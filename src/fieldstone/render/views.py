@@ -31,6 +31,16 @@ class RenderedView:
     opacity: Float[np.ndarray, "h w"]
 
 
+def surface_depth(view: RenderedView, far: float) -> Float[np.ndarray, "h w"]:
+    """Mean distance of what a ray meets; infinite where more than half of the light passes.
+
+    Args:
+        far: Where light that passes ends in `RenderedView.depth`.
+    """
+    met = np.maximum(view.opacity, 0.5)
+    return np.where(view.opacity > 0.5, (view.depth - (1.0 - view.opacity) * far) / met, np.inf)
+
+
 def depth_image(view: RenderedView, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
     """Grey values that are linear in 1 / depth, from 1 at `near` to 0 at `far`; black where little is seen."""
     inverse = 1.0 / np.maximum(view.depth, 1e-12)
