@@ -1,6 +1,6 @@
 import numpy as np
 
-from fieldstone.field.radiance_field import RenderedRays
+from fieldstone.field.radiance_field import RenderedRays, surface_depth
 from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
@@ -12,7 +12,6 @@ from fieldstone.render.views import (
     normal_image,
     progressive_views,
     render_view,
-    surface_depth,
 )
 
 
@@ -106,7 +105,8 @@ def test_confidence_counts_the_photos_that_see_a_point_from_the_same_side():
     rays = views.rays_from_view(camera, here)
     wall = (5.0 / rays.directions[:, 2]).reshape(6, 8)
     opacity = np.full((6, 8), 0.8)
-    view = RenderedView(np.zeros((6, 8, 3)), wall, opacity)
+    # A fifth of the light passes and counts as ending at 9.
+    view = RenderedView(np.zeros((6, 8, 3)), 0.8 * wall + 0.2 * 9.0, opacity)
     for photos, share in (
         ([], 0.0),
         ([here], 0.0),
@@ -114,11 +114,11 @@ def test_confidence_counts_the_photos_that_see_a_point_from_the_same_side():
         ([here] * 2, 0.5),
         ([here, here, here, opposite], 0.75),
     ):
-        found = confidence_image(view, camera, here, [(camera, pose) for pose in photos])
+        found = confidence_image(view, camera, here, [(camera, pose) for pose in photos], 9.0)
         np.testing.assert_allclose(found, 0.8 * share, atol=1e-12)
     # A photo moved by half its width sees half of the wall: 2.5 units are 4 pixels at 8 pixels focal length, depth 5.
     half = Rigid3(np.eye(3), np.array([-2.5, 0.0, 0.0]))
-    found = confidence_image(view, camera, here, [(camera, here), (camera, half)])[:, :, 0]
+    found = confidence_image(view, camera, here, [(camera, here), (camera, half)], 9.0)[:, :, 0]
     np.testing.assert_allclose(found[:, :4], 0.0)
     np.testing.assert_allclose(found[:, 4:], 0.4)
 
@@ -126,5 +126,5 @@ def test_confidence_counts_the_photos_that_see_a_point_from_the_same_side():
 def test_the_surface_is_where_the_light_that_ends_has_ended():
     """A sheet at 3 that stops 80 % of the light before a background at 50; through another, most of it passes."""
     opacity = np.array([[0.8, 0.3, 1.0]])
-    view = RenderedView(np.zeros((1, 3, 3)), opacity * 3.0 + (1 - opacity) * 50.0, opacity)
-    np.testing.assert_allclose(surface_depth(view, 50.0), [[3.0, np.inf, 3.0]])
+    depth = opacity * 3.0 + (1 - opacity) * 50.0
+    np.testing.assert_allclose(surface_depth(depth, opacity, 50.0), [[3.0, np.inf, 3.0]])

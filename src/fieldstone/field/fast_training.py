@@ -43,7 +43,7 @@ from fieldstone.field.free_space import carve_free_space, probably_free
 from fieldstone.field.known_points import known_rays, no_known_rays
 from fieldstone.field.occupancy import Occupancy, full_box, visual_hull
 from fieldstone.field.occupancy_numba import used_cells
-from fieldstone.field.pose_refinement import MovablePhoto, movable_photos, moved_images, refined
+from fieldstone.field.pose_refinement import MovablePhoto, at_surfaces, movable_photos, moved_images, refined
 from fieldstone.field.projection import Projection, no_projection, projection_for
 from fieldstone.field.radiance_field import FieldFrame, RayRenderer, StepReport, in_world
 from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints, poses_in_frame
@@ -225,7 +225,8 @@ class FastTraining:
 
     def _with_refined_poses(self, state: FastState) -> FastState:
         gains = gains_of(state.exposure).astype(np.float64).reshape(-1, 3)
-        render_rays = in_world(self.renderer(state), self.frame)
+        scale = self.frame.normalized_from_world.scale
+        render_rays = at_surfaces(in_world(self.renderer(state), self.frame), self.frame.far / scale)
         moved = state.moved
         for _ in range(POSE_STEPS):
             moved = refined(self.movable, moved, render_rays, gains, self.frame.background)

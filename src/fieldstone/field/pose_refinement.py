@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from fieldstone.field.radiance_field import FieldFrame, RayRenderer, RenderedRays
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, RenderedRays, surface_depth
 from fieldstone.field.ray_dataset import PosedImage, SeenPoints, reduce_images
 from fieldstone.geometry.camera import Camera, image_from_cam_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
@@ -116,6 +116,17 @@ def refined(
         if _cost(there, both, sigma, photo, moved[v] + step) < _cost(here, both, sigma, photo, moved[v]):
             out[v] += step
     return out
+
+
+def at_surfaces(render_rays: RayRenderer, far: float) -> RayRenderer:
+    """The same rays with the distances of what they meet: light that passes does not count as ending at `far`."""
+
+    def render(rays: Rays, /) -> RenderedRays:
+        found = render_rays(rays)
+        depth = surface_depth(found.depth, found.opacity, far)
+        return RenderedRays(found.rgb, np.where(np.isfinite(depth), depth, far).astype(np.float32), found.opacity)
+
+    return render
 
 
 def moved_images(images: Sequence[PosedImage], moved: Float[np.ndarray, "v 6"]) -> tuple[PosedImage, ...]:

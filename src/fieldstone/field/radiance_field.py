@@ -67,6 +67,17 @@ def in_world(render_normalized: RayRenderer, frame: FieldFrame) -> RayRenderer:
     return render
 
 
+def surface_depth(
+    depth: Float[np.ndarray, "*n"], opacity: Float[np.ndarray, "*n"], far: float, least: float = 0.5
+) -> Float[np.ndarray, "*n"]:
+    """Mean distance of what rays meet; infinite where no more than the share `least` of the light is stopped.
+
+    Args:
+        far: Where light that passes ends in `RenderedRays.depth`, in its unit.
+    """
+    return np.where(opacity > least, (depth - (1.0 - opacity) * far) / np.maximum(opacity, least), np.inf)
+
+
 @dataclass(frozen=True)
 class StepReport:
     """What one training step found, before it moved the parameters."""

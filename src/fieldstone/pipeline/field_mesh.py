@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from fieldstone.errors import InputError
 from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
 from fieldstone.field.projection import project_points, unproject_points
-from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world
+from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world, surface_depth
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.atomic import write_json
@@ -29,7 +29,7 @@ from fieldstone.render.camera_paths import up_direction
 from fieldstone.render.depth_fusion import fused
 from fieldstone.render.meshing import cleaned, colored, solidity, surface
 from fieldstone.render.rasterize_numba import mesh_depth
-from fieldstone.render.views import render_view, surface_depth
+from fieldstone.render.views import render_view
 from fieldstone.scene.mesh import Mesh
 from fieldstone.scene.rays import rays_from_view
 
@@ -164,7 +164,8 @@ def normalized_mesh(
 
     def views() -> Iterator[tuple[Camera, Rigid3, Float[np.ndarray, "h w"]]]:
         for camera, pose in compared_views(header, poses, FUSED_VIEWS, FUSED_SIZE_PX, enlarge=True):
-            yield camera, pose, surface_depth(render_view(render_rays, camera, pose), frame.far * world.scale)
+            seen = render_view(render_rays, camera, pose)
+            yield camera, pose, surface_depth(seen.depth, seen.opacity, frame.far * world.scale)
 
     share, more = cleaned(fused(share, level, position, views()), SURFACE)
     floaters += more
@@ -197,7 +198,7 @@ def agreement(
         overlap += int(np.count_nonzero(solid & of_mesh))
         union += int(np.count_nonzero(solid | of_mesh))
         along_z = rays_from_view(camera, pose).directions @ pose.R[2]
-        field_depth = surface_depth(seen, far) * along_z.reshape(depth.shape)
+        field_depth = surface_depth(seen.depth, seen.opacity, far) * along_z.reshape(depth.shape)
         both = of_mesh & (seen.opacity > 0.95)
         depths.append(np.abs(depth[both] / field_depth[both] - 1.0))
     errors = np.concatenate(depths) if depths else np.empty(0)

@@ -137,7 +137,7 @@ def _shown(
     if show == "normals":
         return normal_image(view, camera).astype(np.float32)
     if show == "confidence":
-        return confidence_image(view, camera, cam_from_world, photos).astype(np.float32)
+        return confidence_image(view, camera, cam_from_world, photos, far).astype(np.float32)
     if show == "opacity":
         return np.repeat(view.opacity[:, :, None], 3, axis=2)
     return view.rgb

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.field.radiance_field import RayRenderer
+from fieldstone.field.radiance_field import RayRenderer, surface_depth
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.rays import Rays, rays_from_view
@@ -29,16 +29,6 @@ class RenderedView:
     rgb: Float[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w"]
     opacity: Float[np.ndarray, "h w"]
-
-
-def surface_depth(view: RenderedView, far: float) -> Float[np.ndarray, "h w"]:
-    """Mean distance of what a ray meets; infinite where more than half of the light passes.
-
-    Args:
-        far: Where light that passes ends in `RenderedView.depth`.
-    """
-    met = np.maximum(view.opacity, 0.5)
-    return np.where(view.opacity > 0.5, (view.depth - (1.0 - view.opacity) * far) / met, np.inf)
 
 
 def depth_image(view: RenderedView, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
@@ -66,7 +56,7 @@ def normal_image(view: RenderedView, camera: Camera) -> Float[np.ndarray, "h w 3
 
 
 def confidence_image(
-    view: RenderedView, camera: Camera, cam_from_world: Rigid3, photos: Sequence[tuple[Camera, Rigid3]]
+    view: RenderedView, camera: Camera, cam_from_world: Rigid3, photos: Sequence[tuple[Camera, Rigid3]], far: float
 ) -> Float[np.ndarray, "h w 3"]:
     """How well the photos determine what each pixel shows: opacity times 1 - 2^(1 - n), 0 for n = 0.
 
@@ -76,9 +66,11 @@ def confidence_image(
 
     Args:
         photos: Camera and `cam_from_world` of each.
+        far: Where light that passes ends in `RenderedView.depth`.
     """
     rays = rays_from_view(camera, cam_from_world)
-    points = rays.origins + rays.directions * view.depth.reshape(-1, 1)
+    depth = surface_depth(view.depth, view.opacity, far, least=1e-3).reshape(-1, 1)
+    points = rays.origins + rays.directions * np.where(np.isfinite(depth), depth, np.nan)
     seen = np.zeros(len(points), dtype=np.int64)
     for photo, pose in photos:
         in_cam = pose.apply(points)
