@@ -11,6 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from fieldstone.field.fast_decoder import DIRECTIONS, HIDDEN
 from fieldstone.field.simd_numba import (
     add8,
     at,
@@ -25,7 +26,6 @@ from fieldstone.field.simd_numba import (
     where_nonzero8,
 )  # fmt: skip
 
-HIDDEN = 32
 GROUP = 64
 """Samples whose gradients are summed up before they are added to the gradient of the weights."""
 
@@ -44,12 +44,12 @@ def _basis(directions, ray, out):
 @no_type_check
 def decode_directions(decoder, directions, num_rays, out):  # (r, 3) -> (r, hidden)
     """The part of the hidden layer that is the same for all samples of a ray."""
-    basis = np.empty(8, np.float32)
+    basis = np.empty(DIRECTIONS, np.float32)
     for ray in range(num_rays):
         _basis(directions, ray, basis)
         for q in range(0, HIDDEN, 8):
             value = load8(decoder.hidden_bias, q)
-            for k in range(8):
+            for k in range(DIRECTIONS):
                 value = fma8(spread8_at(basis, k), load8(decoder.direction_weights, k * HIDDEN + q), value)
             store8(out, ray * HIDDEN + q, value)
 
@@ -186,12 +186,12 @@ def _hidden_backward(decoder, start, end, ray, hidden, d_color, d_per_ray, grad)
 @no_type_check
 def _rays_backward(num_rays, directions, d_per_ray, grad):
     """Gradient of D and b."""
-    basis = np.empty(8, np.float32)
+    basis = np.empty(DIRECTIONS, np.float32)
     for ray in range(num_rays):
         _basis(directions, ray, basis)
         for q in range(0, HIDDEN, 8):
             d = load8(d_per_ray, ray * HIDDEN + q)
             store8(grad.hidden_bias, q, add8(d, load8(grad.hidden_bias, q)))
-            for k in range(8):
+            for k in range(DIRECTIONS):
                 o = k * HIDDEN + q
                 store8(grad.direction_weights, o, fma8(spread8_at(basis, k), d, load8(grad.direction_weights, o)))

@@ -107,7 +107,7 @@ def train_fast_run(
     without the stop.
 
     Args:
-        source: A Blender-format folder, or one that `reconstruct` wrote.
+        source: Anything that `field_input.open_field_input` reads.
         budget_s: Seconds for reading and training.
         max_steps: Stop after so many steps of the plan.
         plan: The plan.json of another run, to be followed to the letter; the budget is then ignored.
