@@ -33,7 +33,8 @@ from fieldstone.scene.rays import Rays
 REFERENCE_CELLS = 128
 """Density 1 takes the share 1 - 1/e of the light on 1/128 of the longest side of the box."""
 
-RENDER_MIN_WEIGHT, RENDER_MIN_LIGHT = 1e-3, 3e-3
+RENDER_MIN_WEIGHT, RENDER_MIN_LIGHT = 4e-3, 1e-2
+"""As where open scenes are learned. Lego at 400x400: 0.008 dB less than with 1e-3 and 3e-3, 1.13 times as fast."""
 
 FOREVER = np.float32(1e9)
 

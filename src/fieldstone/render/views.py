@@ -111,12 +111,17 @@ def progressive_views(
     for stride in strides:
         row, column = (np.minimum(np.arange(n) // stride * stride + stride // 2, n - 1) for n in shape)
         shown = row[:, None] * camera.width + column
-        wanted = np.zeros(len(rays), dtype=bool)
-        wanted[shown] = True
-        wanted = np.flatnonzero(wanted & missing)
+        wanted = missing.copy()
+        if stride > 1:
+            wanted[:] = False
+            wanted[shown] = missing[shown]
+        wanted = np.flatnonzero(wanted)
         for start in range(0, len(wanted), RAYS_AT_ONCE):
             rows = wanted[start : start + RAYS_AT_ONCE]
             rendered = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
             rgb[rows], depth[rows], opacity[rows] = rendered.rgb, rendered.depth, rendered.opacity
         missing[wanted] = False
-        yield RenderedView(rgb[shown], depth[shown], opacity[shown])
+        if stride > 1:
+            yield RenderedView(rgb[shown], depth[shown], opacity[shown])
+        else:
+            yield RenderedView(rgb.reshape(*shape, 3), depth.reshape(shape), opacity.reshape(shape))
