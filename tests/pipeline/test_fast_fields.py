@@ -13,7 +13,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.io.photos import write_photo
 from fieldstone.io.posed_photos import PosedPhoto
-from fieldstone.pipeline import fast_fields
+from fieldstone.pipeline import fast_fields, fast_stages
 from fieldstone.pipeline.fast_fields import size_in_memory, train_fast_run
 from fieldstone.pipeline.fields import split_tensors
 
@@ -66,6 +66,19 @@ def test_a_run_out_of_time_is_saved_once(ball_folder, tmp_path, monkeypatch):
     metrics = train_fast_run(ball_folder, tmp_path / "out", budget_s=0.01, threads=1)
     assert metrics["plan"]["stop_after"] == metrics["steps"] < sum(metrics["plan"]["steps"])
     assert saved == [tmp_path / "out" / "checkpoint.safetensors"]
+
+
+def test_what_is_old_is_saved_at_the_end_of_a_stage(ball_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(fast_stages, "SAVED_AFTER_S", 0.0)
+    steps, write = [], fast_fields.write_checkpoint
+
+    def counted(path, tensors, header):
+        steps.append(int(tensors["state.step"]))
+        write(path, tensors, header)
+
+    monkeypatch.setattr(fast_fields, "write_checkpoint", counted)
+    train_fast_run(ball_folder, tmp_path / "out", plan=write_plan(tmp_path / "plan.json"), threads=1)
+    assert steps == [5, 10, 15, 20, 25, 30, 35, 40]
 
 
 def test_the_same_plan_gives_the_same_bytes_however_interrupted(ball_folder, tmp_path):
