@@ -70,8 +70,8 @@ PLAN, PREVIEW = "plan.json", "preview.png"
 PREVIEW_SIZE_PX = 200
 """The first training view is shown at this size now and then."""
 
-MAX_SIZE_PX = 4096
-"""Photos are reduced to this length of their longer side."""
+MAX_SIZE_PX, LEAST_SIZE_PX = 4096, 200
+"""Photos are reduced to a length of their longer side between these, as memory allows."""
 
 TIME_KEPT = 0.97
 """Share of the budget that is planned for: the last steps and the last checkpoint take what they take."""
@@ -282,7 +282,7 @@ def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
     pixels = sum(camera.width * camera.height for camera in cameras)
     share = RAYS_SHARE * memory_gib * 2**30 / (BYTES_PER_PIXEL * max(pixels, 1))
     longest = max((max(camera.width, camera.height) for camera in cameras), default=MAX_SIZE_PX)
-    size = min(MAX_SIZE_PX, longest, max(int(longest * min(share, 1.0) ** 0.5), PREVIEW_SIZE_PX))
+    size = min(MAX_SIZE_PX, longest, max(int(longest * min(share, 1.0) ** 0.5), LEAST_SIZE_PX))
     if size < longest:
         logger.info("photos are reduced to %d pixels, so that rays and grids fit %g GiB", size, memory_gib)
     return size
