@@ -19,8 +19,8 @@ import numpy as np
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
-from fieldstone.solve.absolute_pose import estimate_absolute_pose
-from fieldstone.solve.ransac import RansacOptions
+from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose
+from fieldstone.solve.robust.ransac import RansacOptions
 
 CAMERA = Camera("PINHOLE", 1600, 1200, np.array([1400.0, 1400.0, 800.0, 600.0]))
 OUTLIERS = (0.3, 0.5, 0.7, 0.9)

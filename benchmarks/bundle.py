@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks.bundle_problems import RingOptions, ring_problem
 from fieldstone.io.bal import read_bal
-from fieldstone.solve.bundle import BundleOptions, bundle_adjust
-from fieldstone.solve.bundle_problem import BundleProblem
-from fieldstone.solve.bundle_scipy import bundle_adjust_scipy
+from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle.problem import BundleProblem
+from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy
 
 GENERATED = {
     "ring50": RingOptions(50, 10_000, reach=25),

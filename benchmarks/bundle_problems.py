@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.bundle_problem import BundleProblem, updated
+from fieldstone.solve.bundle.problem import BundleProblem, updated
 
 RING_RADIUS = 10.0
 CLOUD_RADIUS = 3.0

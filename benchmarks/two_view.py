@@ -25,8 +25,8 @@ from fieldstone.evaluate.reconstruction_metrics import area_under_curve
 from fieldstone.geometry.camera import Camera, plane_from_image, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
-from fieldstone.solve.ransac import RansacOptions
-from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
+from fieldstone.solve.robust.ransac import RansacOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
 
 MIN_MATCHES = 30
 CONFIDENCE = 0.9999

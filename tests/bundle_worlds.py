@@ -9,7 +9,7 @@ import numpy as np
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
-from fieldstone.solve.bundle_problem import BundleProblem, updated
+from fieldstone.solve.bundle.problem import BundleProblem, updated
 
 CAMERAS = (
     Camera("SIMPLE_RADIAL", 800, 600, np.array([700.0, 400, 300, -0.05])),

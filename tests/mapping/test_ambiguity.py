@@ -17,7 +17,7 @@ from fieldstone.mapping.rotation_forest import tree_of_most_inliers
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.symmetric import SymmetricOptions, SymmetricScene, synthesize_symmetric
 
 

@@ -8,7 +8,7 @@ from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.calibration import LADDER, as_model, growing_step, priors, steps_above
 from fieldstone.scene.alignment import align
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 from matchers import assert_reconstruction_near
 

@@ -4,7 +4,7 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 from matchers import assert_reconstruction_near
 

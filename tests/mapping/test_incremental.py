@@ -11,7 +11,7 @@ from fieldstone.mapping.self_calibration import _leave_one_out, prediction_error
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import build_tracks
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from matchers import assert_reconstruction_near
 

@@ -10,7 +10,7 @@ from fieldstone.mapping.structureless import pose_from_partners
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from matchers import assert_reconstruction_near, assert_rigid3_near
 

@@ -8,8 +8,8 @@ from fieldstone.geometry.rotation import log
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.uncertainty import LOSSES, robust_factor
 from fieldstone.scene.alignment import align, transformed
-from fieldstone.solve.bundle import BundleOptions
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.bundle.adjustment import BundleOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 
 

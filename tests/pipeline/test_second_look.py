@@ -14,7 +14,7 @@ from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.second_look import SecondLook
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from matchers import assert_reconstruction_near
 

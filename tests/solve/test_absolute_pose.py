@@ -7,9 +7,9 @@ from jaxtyping import TypeCheckError
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
-from fieldstone.solve.absolute_pose import estimate_absolute_pose, plane_to_pixels, squared_errors
-from fieldstone.solve.ransac import RansacOptions
-from fieldstone.solve.reprojection_numba import BLOCK, pose_normal_equations_numba, score_pose_numba
+from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose, plane_to_pixels, squared_errors
+from fieldstone.solve.robust.ransac import RansacOptions
+from fieldstone.solve.robust.reprojection_numba import BLOCK, pose_normal_equations_numba, score_pose_numba
 from matchers import assert_rigid3_near, check_jacobian
 
 PINHOLE = Camera("PINHOLE", 1600, 1200, np.array([1400.0, 1380.0, 805.0, 590.0]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from fieldstone.solve.block_sums_numba import BLOCK, LANES, block_dot, block_sum
+from fieldstone.solve.algebra.block_sums_numba import BLOCK, LANES, block_dot, block_sum
 
 
 @njit

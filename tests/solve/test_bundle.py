@@ -8,11 +8,11 @@ from bundle_worlds import mixed_problem, perturbed, without_refinement
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.bal import read_bal
-from fieldstone.solve.bundle import BundleOptions, bundle_adjust
-from fieldstone.solve.bundle_problem import BundleProblem, reprojection_residuals
-from fieldstone.solve.bundle_scipy import bundle_adjust_scipy
-from fieldstone.solve.camera_prior import CameraPrior
-from fieldstone.solve.robust_loss import cauchy, huber, soft_l1, trivial
+from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle.camera_prior import CameraPrior
+from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals
+from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy
+from fieldstone.solve.robust.loss import cauchy, huber, soft_l1, trivial
 from matchers import assert_rigid3_near
 from real_data import data_folder
 

@@ -5,10 +5,10 @@ import pytest
 
 from bundle_worlds import mixed_problem, without_refinement
 from fieldstone.geometry.rotation import log
-from fieldstone.solve.bundle import BundleOptions, bundle_adjust
-from fieldstone.solve.bundle_covariance import bundle_covariance
-from fieldstone.solve.robust_loss import trivial
-from fieldstone.solve.schur import normal_equations
+from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle.covariance import bundle_covariance
+from fieldstone.solve.bundle.schur import normal_equations
+from fieldstone.solve.robust.loss import trivial
 
 
 def held_problem():

@@ -6,9 +6,9 @@ import pytest
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
-from fieldstone.solve.bundle_problem import BundleProblem, reprojection_jacobian, reprojection_residuals, updated
-from fieldstone.solve.bundle_scipy import bundle_adjust_scipy
-from fieldstone.solve.robust_loss import cauchy, huber, robustify, soft_l1, trivial
+from fieldstone.solve.bundle.problem import BundleProblem, reprojection_jacobian, reprojection_residuals, updated
+from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy
+from fieldstone.solve.robust.loss import cauchy, huber, robustify, soft_l1, trivial
 from matchers import check_jacobian
 
 

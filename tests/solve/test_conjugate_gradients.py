@@ -1,6 +1,6 @@
 import numpy as np
 
-from fieldstone.solve.conjugate_gradients import conjugate_gradients
+from fieldstone.solve.algebra.conjugate_gradients import conjugate_gradients
 
 
 def solved(*args, **options) -> np.ndarray:

@@ -4,8 +4,8 @@ import pytest
 from fieldstone.geometry.epipolar import essential_from_pose
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
-from fieldstone.solve.focal_voting import focal_cost, vote_focal, vote_focal_of_rotations
-from fieldstone.solve.linear_two_view import fundamental_eight_point
+from fieldstone.solve.minimal.eight_point import fundamental_eight_point
+from fieldstone.solve.robust.focal_voting import focal_cost, vote_focal, vote_focal_of_rotations
 
 
 def pairs(focal: float, count: int, noise: float, seed: int = 0) -> np.ndarray:

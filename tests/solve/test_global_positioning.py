@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.sim3 import fit_sim3
-from fieldstone.solve.global_positioning import position_views_and_points
+from fieldstone.solve.averaging.positions import position_views_and_points
 
 
 def observed(centers: np.ndarray, points: np.ndarray, share: float, rng: np.random.Generator):

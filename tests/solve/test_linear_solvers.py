@@ -12,11 +12,11 @@ from fieldstone.geometry.epipolar import (
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
 from fieldstone.geometry.triangulation import choose_by_cheirality, triangulate_linear
-from fieldstone.solve.linear_pnp import PnpEstimator, pnp_linear, pose_from_matrix
-from fieldstone.solve.linear_two_view import FundamentalEstimator, fundamental_eight_point
-from fieldstone.solve.nonlinear import pnp_nonlinear, triangulate_nonlinear
-from fieldstone.solve.ransac import RansacOptions, draw_samples, ransac, trials_needed
-from fieldstone.solve.robust_loss import cauchy
+from fieldstone.solve.minimal.eight_point import FundamentalEstimator, fundamental_eight_point
+from fieldstone.solve.minimal.linear_pnp import PnpEstimator, pnp_linear, pose_from_matrix
+from fieldstone.solve.robust.loss import cauchy
+from fieldstone.solve.robust.nonlinear import pnp_nonlinear, triangulate_nonlinear
+from fieldstone.solve.robust.ransac import RansacOptions, draw_samples, ransac, trials_needed
 
 CAMERA = Camera("SIMPLE_RADIAL", 800, 600, np.array([600.0, 400, 300, -0.03]))
 K = CAMERA.calibration_matrix()

@@ -7,13 +7,13 @@ from fieldstone.geometry.epipolar import essential_from_pose
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
 from fieldstone.geometry.triangulation import bearings
-from fieldstone.solve.five_point import five_point
-from fieldstone.solve.fundamental_numba import plane_and_parallax_numba, set_rank_two_numba
-from fieldstone.solve.homography import homography_four_point
-from fieldstone.solve.null_space_numba import null_space_numba
-from fieldstone.solve.p3p import p3p
-from fieldstone.solve.polynomial_roots import real_roots_numba, real_roots_of_cubic, real_roots_of_quadratic
-from fieldstone.solve.seven_point import seven_point
+from fieldstone.solve.algebra.null_space_numba import null_space_numba
+from fieldstone.solve.algebra.polynomial_roots import real_roots_numba, real_roots_of_cubic, real_roots_of_quadratic
+from fieldstone.solve.minimal.five_point import five_point
+from fieldstone.solve.minimal.p3p import p3p
+from fieldstone.solve.minimal.seven_point import seven_point
+from fieldstone.solve.robust.fundamental_numba import plane_and_parallax_numba, set_rank_two_numba
+from fieldstone.solve.robust.homography import homography_four_point
 
 DRAWS = 1000
 

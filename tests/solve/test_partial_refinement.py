@@ -5,11 +5,11 @@ import pytest
 
 from bundle_worlds import CAMERAS, mixed_problem, perturbed, without_refinement
 from fieldstone.geometry.camera import image_from_cam
-from fieldstone.solve.bundle import BundleOptions, bundle_adjust
-from fieldstone.solve.bundle_problem import reprojection_residuals
-from fieldstone.solve.bundle_scipy import bundle_adjust_scipy
-from fieldstone.solve.partial_refinement import refine_points, refine_pose
-from fieldstone.solve.robust_loss import huber
+from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle.partial_refinement import refine_points, refine_pose
+from fieldstone.solve.bundle.problem import reprojection_residuals
+from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy
+from fieldstone.solve.robust.loss import huber
 from matchers import assert_rigid3_near
 
 TIGHT = BundleOptions(relative_tolerance=1e-14, max_iterations=100)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import CAMERA_MODELS, Camera, image_from_cam_jacobian
-from fieldstone.solve.projection_numba import MAX_CAMERA_PARAMS, image_from_cam_numba, robust_numba
-from fieldstone.solve.robust_loss import cauchy, huber, soft_l1, trivial
+from fieldstone.solve.projection.projection_numba import MAX_CAMERA_PARAMS, image_from_cam_numba, robust_numba
+from fieldstone.solve.robust.loss import cauchy, huber, soft_l1, trivial
 
 COEFFICIENTS = np.array([-0.1, 0.03, 2e-3, -1e-3, 0.01, 0.02, -0.01, 0.005])
 

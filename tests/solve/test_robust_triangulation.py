@@ -2,7 +2,7 @@ import numpy as np
 
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
-from fieldstone.solve.robust_triangulation import triangulate_robust
+from fieldstone.solve.robust.triangulation import triangulate_robust
 
 FOCAL = 1000.0
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
-from fieldstone.solve.rotation_averaging import average_rotations, residual_rotations
+from fieldstone.solve.averaging.rotations import average_rotations, residual_rotations
 
 
 def edges_of(num_views: int, per_view: int, rng: np.random.Generator):

@@ -7,11 +7,10 @@ import pytest
 from bundle_worlds import mixed_problem, perturbed, without_refinement
 from fieldstone.geometry import rotation
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.bundle_layout import lay_out
-from fieldstone.solve.bundle_problem import BundleProblem, reprojection_residuals, updated
-from fieldstone.solve.robust_loss import cauchy, huber, trivial
-from fieldstone.solve.schur import damped_step, normal_equations, reduced_camera_system
-from fieldstone.solve.schur_solver import (
+from fieldstone.solve.bundle.layout import lay_out
+from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals, updated
+from fieldstone.solve.bundle.schur import damped_step, normal_equations, reduced_camera_system
+from fieldstone.solve.bundle.schur_solver import (
     Values,
     Workers,
     allocate,
@@ -22,7 +21,8 @@ from fieldstone.solve.schur_solver import (
     start_values,
     tile_pattern,
 )
-from fieldstone.solve.schur_step import solve_step
+from fieldstone.solve.bundle.schur_step import solve_step
+from fieldstone.solve.robust.loss import cauchy, huber, trivial
 
 PIVOT = np.array([0.3, -0.2, 0.5])
 ZERO = np.zeros(3)

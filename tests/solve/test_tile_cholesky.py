@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.solve.tile_cholesky_numba import (
+from fieldstone.solve.algebra.tile_cholesky_numba import (
     cholesky_in_place_numba,
     factor_column_numba,
     factor_diagonal_numba,

@@ -8,18 +8,18 @@ from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.epipolar import essential_from_pose, homogeneous, poses_from_essential, sampson_error
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp
-from fieldstone.solve.epipolar_numba import (
+from fieldstone.solve.robust.epipolar_numba import (
     BLOCK,
     epipolar_errors_numba,
     epipolar_normal_equations_numba,
     score_epipolar_numba,
 )
-from fieldstone.solve.essential_numba import choose_pose_numba, other_rotation_numba, state_from_essential_numba
-from fieldstone.solve.homography import homography_normal_equations_numba
-from fieldstone.solve.match_data import match_data
-from fieldstone.solve.plane_or_rotation import motions_of_plane, transfer_errors
-from fieldstone.solve.ransac import RansacOptions
-from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
+from fieldstone.solve.robust.essential_numba import choose_pose_numba, other_rotation_numba, state_from_essential_numba
+from fieldstone.solve.robust.homography import homography_normal_equations_numba
+from fieldstone.solve.robust.match_data import match_data
+from fieldstone.solve.robust.plane_or_rotation import motions_of_plane, transfer_errors
+from fieldstone.solve.robust.ransac import RansacOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
 from matchers import check_jacobian
 
 CAMERA1 = Camera("PINHOLE", 1600, 1200, np.array([1400.0, 1400.0, 805.0, 590.0]))

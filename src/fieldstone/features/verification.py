@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
-from fieldstone.solve.focal_voting import FocalVote, vote_focal, vote_focal_of_rotations
-from fieldstone.solve.two_view import TwoViewOptions, estimate_two_view
+from fieldstone.solve.robust.focal_voting import FocalVote, vote_focal, vote_focal_of_rotations
+from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
 
 MAX_VOTING_PAIRS = 300
 

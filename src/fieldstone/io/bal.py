@@ -19,7 +19,7 @@ from fieldstone.errors import InputError
 from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.bundle_problem import BundleProblem
+from fieldstone.solve.bundle.problem import BundleProblem
 
 CAM_FROM_BAL_CAM = np.diag([1.0, -1.0, -1.0])
 IMAGE_FROM_BAL_IMAGE = np.array([1.0, -1.0])

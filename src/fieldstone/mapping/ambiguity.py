@@ -31,7 +31,7 @@ from fieldstone.mapping.rotation_forest import (
 )
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
-from fieldstone.solve.two_view import degenerate
+from fieldstone.solve.robust.two_view import degenerate
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from fieldstone.geometry.camera import CAMERA_MODELS, Camera, plane_from_image
-from fieldstone.solve.camera_prior import CameraPrior
+from fieldstone.solve.bundle.camera_prior import CameraPrior
 
 PRINCIPAL_POINT_SIGMA = 0.02
 """Standard deviation of the principal point about the centre of the photo, as a share of the longer side."""

@@ -21,8 +21,8 @@ from fieldstone.mapping.refinement import adjust
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
-from fieldstone.solve.global_positioning import position_views_and_points
-from fieldstone.solve.rotation_averaging import average_rotations, residual_rotations
+from fieldstone.solve.averaging.positions import position_views_and_points
+from fieldstone.solve.averaging.rotations import average_rotations, residual_rotations
 
 logger = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.mapping.working_model import WorkingModel
-from fieldstone.solve.robust_triangulation import triangulate_robust
-from fieldstone.solve.undistortion import plane_from_images
+from fieldstone.solve.projection.undistortion import plane_from_images
+from fieldstone.solve.robust.triangulation import triangulate_robust
 
 
 def retriangulate(

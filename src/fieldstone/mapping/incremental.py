@@ -21,7 +21,7 @@ from fieldstone.mapping.view_selection import next_views
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
-from fieldstone.solve.ransac import RansacOptions
+from fieldstone.solve.robust.ransac import RansacOptions
 
 logger = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from fieldstone.geometry.triangulation import triangulate_tracks_linear
 from fieldstone.mapping.growth import plane_coordinates
 from fieldstone.mapping.record import Drop, StageRecord
 from fieldstone.mapping.working_model import WorkingModel, record_views, reprojections
-from fieldstone.solve.nonlinear import triangulate_nonlinear
-from fieldstone.solve.robust_loss import soft_l1
+from fieldstone.solve.robust.loss import soft_l1
+from fieldstone.solve.robust.nonlinear import triangulate_nonlinear
 
 
 def triangulate_new_points(

@@ -12,8 +12,8 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.calibration import CalibrationStep, priors, with_models
 from fieldstone.mapping.growth import covering_tracks, retriangulate
 from fieldstone.mapping.working_model import WorkingModel, reprojections
-from fieldstone.solve.bundle import BundleOptions, bundle_adjust
-from fieldstone.solve.bundle_problem import BundleProblem
+from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
+from fieldstone.solve.bundle.problem import BundleProblem
 
 CAUCHY_SIGMAS = 2.385
 """Where a Cauchy loss has 95 % of the efficiency of least squares under normal noise."""

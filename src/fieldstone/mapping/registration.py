@@ -15,8 +15,8 @@ from fieldstone.geometry.triangulation import in_front_of_both, triangulate_line
 from fieldstone.mapping.rotation_forest import AGREE
 from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
-from fieldstone.solve.absolute_pose import estimate_absolute_pose
-from fieldstone.solve.ransac import RansacOptions
+from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose
+from fieldstone.solve.robust.ransac import RansacOptions
 
 BEST_START_ANGLE_DEG = 20.0
 """Wider rays than these make a start no better."""

@@ -14,8 +14,8 @@ from fieldstone.mapping.calibration import LADDER, CalibrationStep, steps_above
 from fieldstone.mapping.growth import covering_tracks, plane_coordinates
 from fieldstone.mapping.refinement import Calibration, RefinementOptions, adjust
 from fieldstone.mapping.working_model import WorkingModel
-from fieldstone.solve.robust_loss import cauchy
-from fieldstone.solve.robust_triangulation import triangulate_robust
+from fieldstone.solve.robust.loss import cauchy
+from fieldstone.solve.robust.triangulation import triangulate_robust
 
 logger = logging.getLogger(__name__)
 

@@ -23,13 +23,13 @@ from fieldstone.mapping.record import Drop, InitialPair, MappingRun, StageRecord
 from fieldstone.mapping.working_model import WorkingModel, record_views, reprojections, to_reconstruction
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.scene.tracks import build_tracks
-from fieldstone.solve.bundle_problem import BundleProblem
-from fieldstone.solve.bundle_scipy import bundle_adjust_scipy
-from fieldstone.solve.linear_pnp import PnpEstimator, pnp_linear, pose_from_matrix
-from fieldstone.solve.linear_two_view import FundamentalEstimator
-from fieldstone.solve.nonlinear import pnp_nonlinear
-from fieldstone.solve.ransac import RansacOptions, ransac
-from fieldstone.solve.robust_loss import soft_l1
+from fieldstone.solve.bundle.problem import BundleProblem
+from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy
+from fieldstone.solve.minimal.eight_point import FundamentalEstimator
+from fieldstone.solve.minimal.linear_pnp import PnpEstimator, pnp_linear, pose_from_matrix
+from fieldstone.solve.robust.loss import soft_l1
+from fieldstone.solve.robust.nonlinear import pnp_nonlinear
+from fieldstone.solve.robust.ransac import RansacOptions, ransac
 
 logger = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from fieldstone.mapping.calibration import priors
 from fieldstone.mapping.record import Uncertainty
 from fieldstone.mapping.refinement import Calibration, RefinementOptions, bundle_problem
 from fieldstone.mapping.working_model import WorkingModel, reprojections
-from fieldstone.solve.bundle import BundleOptions
-from fieldstone.solve.bundle_covariance import bundle_covariance
-from fieldstone.solve.robust_loss import RobustLoss, cauchy, huber, soft_l1, trivial
+from fieldstone.solve.bundle.adjustment import BundleOptions
+from fieldstone.solve.bundle.covariance import bundle_covariance
+from fieldstone.solve.robust.loss import RobustLoss, cauchy, huber, soft_l1, trivial
 
 LOSSES: dict[str, Callable[[float], RobustLoss]] = {
     "trivial": lambda _: trivial(), "huber": huber, "soft_l1": soft_l1, "cauchy": cauchy

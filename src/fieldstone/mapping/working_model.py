@@ -14,7 +14,7 @@ from fieldstone.mapping.record import StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations, compact_points
-from fieldstone.solve.bundle_problem import BundleProblem
+from fieldstone.solve.bundle.problem import BundleProblem
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fieldstone.features.pairs import PairOptions
 from fieldstone.features.sift import SiftOptions
-from fieldstone.solve.two_view import TwoViewOptions
+from fieldstone.solve.robust.two_view import TwoViewOptions
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from fieldstone.geometry.camera import Camera, rescale, turned
 from fieldstone.io.photos import PhotoInfo
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.solve.focal_voting import FocalVote
+from fieldstone.solve.robust.focal_voting import FocalVote
 
 logger = logging.getLogger(__name__)
 

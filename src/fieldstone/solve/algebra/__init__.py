@@ -1,0 +1,1 @@
+"""Small algebra, compiled: what the solvers stand on."""

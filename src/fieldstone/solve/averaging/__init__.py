@@ -1,0 +1,1 @@
+"""All cameras at once: rotations from relative ones, then positions."""
