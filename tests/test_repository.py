@@ -47,5 +47,5 @@ def test_no_data_file_is_large():
 
 
 def test_no_kernel_may_reorder_its_sums():
-    """A permit makes the last bits depend on which kernels were compiled before, see `solve/algebra/block_sums_numba.py`."""
+    """A permit lets the last bits depend on which kernels came before, see `solve/algebra/block_sums_numba.py`."""
     assert not [path for path in SOURCES if "fastmath" in path.read_text()]

@@ -7,14 +7,14 @@ from fieldstone.evaluate.reconstruction_metrics import pairwise_pose_errors_deg
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp
-from fieldstone.mapping import ambiguity
-from fieldstone.mapping.ambiguity import contradictions, pairs_with_rotation, resolve_ambiguity
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.conflicts import find_conflicts
-from fieldstone.mapping.record import MappingRun
-from fieldstone.mapping.registration import contradicts_pairs
-from fieldstone.mapping.rotation_forest import tree_of_most_inliers
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.disambiguation import ambiguity
+from fieldstone.mapping.disambiguation.ambiguity import contradictions, pairs_with_rotation, resolve_ambiguity
+from fieldstone.mapping.disambiguation.missing_correspondences import find_conflicts
+from fieldstone.mapping.disambiguation.rotation_forest import tree_of_most_inliers
+from fieldstone.mapping.incremental.registration import contradicts_pairs
+from fieldstone.mapping.model.working_model import WorkingModel
+from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 from fieldstone.solve.robust.two_view import TwoViewOptions

@@ -6,7 +6,7 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.calibration import LADDER, as_model, growing_step, priors, steps_above
+from fieldstone.mapping.model.calibration import LADDER, as_model, growing_step, priors, steps_above
 from fieldstone.scene.alignment import align
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize

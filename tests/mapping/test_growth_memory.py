@@ -7,8 +7,8 @@ import pytest
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.io.workspace import Workspace
-from fieldstone.mapping.calibration import CalibrationStep, as_model
-from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, map_incremental
+from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, map_incremental
+from fieldstone.mapping.model.calibration import CalibrationStep, as_model
 from fieldstone.pipeline.kept_growth import KeptGrowth
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 

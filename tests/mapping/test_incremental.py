@@ -6,9 +6,9 @@ import pytest
 from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.growth import covering_tracks, retriangulate
+from fieldstone.mapping.model.triangulation import covering_tracks, retriangulate
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.mapping.self_calibration import _leave_one_out, prediction_errors
-from fieldstone.mapping.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.robust.two_view import TwoViewOptions

@@ -6,8 +6,8 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.structureless import pose_from_partners
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.incremental.structureless import pose_from_partners
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 from fieldstone.solve.robust.two_view import TwoViewOptions

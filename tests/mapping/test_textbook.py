@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from fieldstone.mapping.record import STAGES
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
+from fieldstone.scene.mapping_run import STAGES
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 from matchers import assert_reconstruction_near

@@ -6,7 +6,7 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.rotation import log
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.uncertainty import LOSSES, robust_factor
+from fieldstone.mapping.model.uncertainty import LOSSES, robust_factor
 from fieldstone.scene.alignment import align, transformed
 from fieldstone.solve.bundle.adjustment import BundleOptions
 from fieldstone.solve.robust.two_view import TwoViewOptions

@@ -1,7 +1,7 @@
 import numpy as np
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.view_selection import spread
+from fieldstone.mapping.incremental.view_selection import spread
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 320, 240]))
 

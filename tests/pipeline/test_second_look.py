@@ -8,7 +8,7 @@ from fieldstone.features.verification import verify_pairs
 from fieldstone.io.exif import ExifFacts
 from fieldstone.io.photos import PhotoInfo
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.rescue import Wanted
+from fieldstone.mapping.incremental.recovery import Wanted
 from fieldstone.pipeline.detection import SeenPhoto
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.second_look import SecondLook

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from drawn_figures import drawn, in_panel, pixels, positions, vertices, words
-from fieldstone.mapping.record import StageRecord
 from fieldstone.report.chart_figures import (
     DIFFERENCE_GAIN,
     difference_image,
@@ -18,6 +17,7 @@ from fieldstone.report.chart_figures import (
     training_figure,
 )
 from fieldstone.report.theme import DARK, LIGHT, evenly, label, readable_colors
+from fieldstone.scene.mapping_run import StageRecord
 from fieldstone.scene.tracks import Observations
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 

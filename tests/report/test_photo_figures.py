@@ -9,7 +9,6 @@ import pytest
 
 from drawn_figures import SVG, centers, drawn, in_panel, pixels, positions, segments, tolerance, vertices, words
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.record import StageRecord
 from fieldstone.report.photo_figures import (
     distance_to_curves,
     epipolar_curves,
@@ -21,6 +20,7 @@ from fieldstone.report.photo_figures import (
     reprojections_figure,
 )
 from fieldstone.report.theme import label
+from fieldstone.scene.mapping_run import StageRecord
 from fieldstone.scene.match_graph import TwoView
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 

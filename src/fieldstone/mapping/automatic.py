@@ -11,20 +11,20 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.ambiguity import resolve_ambiguity, with_ambiguity
-from fieldstone.mapping.calibration import CalibrationStep, growing_step, with_models
+from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity, with_ambiguity
 from fieldstone.mapping.global_mapper import map_global
-from fieldstone.mapping.growth_memory import GrowthMemory
-from fieldstone.mapping.incremental import GrownModel, IncrementalOptions, collapsed, map_incremental
-from fieldstone.mapping.point_update import drop_outliers
-from fieldstone.mapping.record import Drop, MappingRun, StageRecord
-from fieldstone.mapping.refinement import RefinementOptions, adjust, loss_scale, refine_until_stable
-from fieldstone.mapping.registration import verdict_of_pairs
-from fieldstone.mapping.rescue import MoreMatches, rescue
+from fieldstone.mapping.incremental.checkpoint import GrowthMemory
+from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, collapsed, map_incremental
+from fieldstone.mapping.incremental.recovery import MoreMatches, rescue
+from fieldstone.mapping.incremental.registration import verdict_of_pairs
+from fieldstone.mapping.model.calibration import CalibrationStep, growing_step, with_models
+from fieldstone.mapping.model.outliers import drop_outliers
+from fieldstone.mapping.model.refinement import RefinementOptions, adjust, loss_scale, refine_until_stable
+from fieldstone.mapping.model.uncertainty import model_uncertainty
+from fieldstone.mapping.model.working_model import WorkingModel, record_views, to_reconstruction
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
 from fieldstone.mapping.textbook import four_poses
-from fieldstone.mapping.uncertainty import model_uncertainty
-from fieldstone.mapping.working_model import WorkingModel, record_views, to_reconstruction
+from fieldstone.scene.mapping_run import Drop, MappingRun, StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 

@@ -13,12 +13,12 @@ from scipy.sparse.csgraph import connected_components
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.calibration import CalibrationStep
-from fieldstone.mapping.growth import covering_tracks, plane_coordinates, retriangulate
-from fieldstone.mapping.growth_memory import GrowthMemory
-from fieldstone.mapping.incremental import LADDER, GrownModel, IncrementalOptions, grow
-from fieldstone.mapping.refinement import adjust
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.incremental.checkpoint import GrowthMemory
+from fieldstone.mapping.incremental.mapper import LADDER, GrownModel, IncrementalOptions, grow
+from fieldstone.mapping.model.calibration import CalibrationStep
+from fieldstone.mapping.model.refinement import adjust
+from fieldstone.mapping.model.triangulation import covering_tracks, plane_coordinates, retriangulate
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.averaging.positions import position_views_and_points

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import image_from_cam
-from fieldstone.mapping.calibration import LADDER, CalibrationStep, steps_above
-from fieldstone.mapping.growth import covering_tracks, plane_coordinates
-from fieldstone.mapping.refinement import Calibration, RefinementOptions, adjust
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.model.calibration import LADDER, CalibrationStep, steps_above
+from fieldstone.mapping.model.refinement import Calibration, RefinementOptions, adjust
+from fieldstone.mapping.model.triangulation import covering_tracks, plane_coordinates
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.solve.robust.loss import cauchy
 from fieldstone.solve.robust.triangulation import triangulate_robust
 

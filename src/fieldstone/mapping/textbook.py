@@ -18,9 +18,9 @@ from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.epipolar import essential_from_fundamental, essential_from_pose, poses_from_essential
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.triangulation import choose_by_cheirality, triangulate_linear, triangulation_angles
-from fieldstone.mapping.point_update import drop_outliers, recall_observations, triangulate_new_points
-from fieldstone.mapping.record import Drop, InitialPair, MappingRun, StageRecord
-from fieldstone.mapping.working_model import WorkingModel, record_views, reprojections, to_reconstruction
+from fieldstone.mapping.model.outliers import drop_outliers, recall_observations, triangulate_new_points
+from fieldstone.mapping.model.working_model import WorkingModel, record_views, reprojections, to_reconstruction
+from fieldstone.scene.mapping_run import Drop, InitialPair, MappingRun, StageRecord
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.bundle.problem import BundleProblem

@@ -14,7 +14,7 @@ STAGE = "growth"
 
 @dataclass(frozen=True)
 class KeptGrowth:
-    """A `mapping.growth_memory.GrowthMemory` over the workspace of a run."""
+    """A `mapping.incremental.checkpoint.GrowthMemory` over the workspace of a run."""
 
     workspace: Workspace
 

@@ -18,7 +18,7 @@ from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.matching_txt import read_course_folder
 from fieldstone.io.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.io.workspace import Workspace
-from fieldstone.mapping.rescue import MoreMatches
+from fieldstone.mapping.incremental.recovery import MoreMatches
 from fieldstone.pipeline.detection import detect
 from fieldstone.pipeline.matched_pairs import match_pairs, verify
 from fieldstone.pipeline.matching_options import MatchingOptions

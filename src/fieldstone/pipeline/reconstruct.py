@@ -23,10 +23,9 @@ from fieldstone.io.lock import sole_writer
 from fieldstone.io.matching_txt import is_course_folder
 from fieldstone.io.ply import write_points
 from fieldstone.io.workspace import Workspace
-from fieldstone.mapping.ambiguity import resolve_ambiguity
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.growth_memory import GrowthMemory
-from fieldstone.mapping.record import MappingRun, StageRecord
+from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity
+from fieldstone.mapping.incremental.checkpoint import GrowthMemory
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
 from fieldstone.pipeline.kept_growth import KeptGrowth
 from fieldstone.pipeline.matching_options import MatchingOptions
@@ -34,6 +33,7 @@ from fieldstone.pipeline.material import Material, OnStage, match_photos, read_c
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
+from fieldstone.scene.mapping_run import MappingRun, StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction, View
 

@@ -14,7 +14,7 @@ from fieldstone.features.matching import match_mutual
 from fieldstone.features.pairs import preview_counts
 from fieldstone.features.sift import Sift
 from fieldstone.features.verification import two_views_of_pairs
-from fieldstone.mapping.rescue import MoreMatches, Wanted
+from fieldstone.mapping.incremental.recovery import MoreMatches, Wanted
 from fieldstone.pipeline.detection import SeenPhoto, opencv_threads
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.features import Features

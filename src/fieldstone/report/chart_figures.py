@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from fieldstone.mapping.record import StageRecord
 from fieldstone.report import raster, svg
 from fieldstone.report.panel import TITLE_RISE, Panel, axes, title, whole_ticks
 from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, label, luminance, mixed, rgb_of
+from fieldstone.scene.mapping_run import StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 

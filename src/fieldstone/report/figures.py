@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.record import MappingRun, StageRecord
 from fieldstone.report import chart_figures, model_figures, photo_figures
 from fieldstone.report.figure_store import ReportFigure
 from fieldstone.report.raster import DRAWN_PX, small
 from fieldstone.report.theme import evenly
+from fieldstone.scene.mapping_run import MappingRun, StageRecord
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 PhotoByName = Callable[[str], UInt8[np.ndarray, "_ _ 3"] | None]

@@ -11,11 +11,11 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import angle_between, nearest_rotation
 from fieldstone.geometry.sim3 import Sim3
-from fieldstone.mapping.record import InitialPair
 from fieldstone.report import raster, svg
 from fieldstone.report.panel import Panel, axes, ticks, title
 from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, evenly, label, mixed, readable_colors, rgb_of
 from fieldstone.scene.alignment import common_poses, transformed
+from fieldstone.scene.mapping_run import InitialPair
 from fieldstone.scene.reconstruction import Reconstruction
 
 MOST_NAMES = 30

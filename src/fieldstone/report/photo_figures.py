@@ -15,10 +15,10 @@ from jaxtyping import Float, Int, UInt8
 
 from fieldstone.geometry.camera import Camera, image_from_plane, plane_from_image
 from fieldstone.geometry.epipolar import homogeneous
-from fieldstone.mapping.record import StageRecord
 from fieldstone.report import raster, svg
 from fieldstone.report.panel import Panel, title
 from fieldstone.report.theme import LIGHTBOX, Theme, evenly, label
+from fieldstone.scene.mapping_run import StageRecord
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 MaybePhoto = UInt8[np.ndarray, "_ _ 3"] | None

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, nearest_rotation
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 
 MAX_ANGLE = np.deg2rad(5.0)

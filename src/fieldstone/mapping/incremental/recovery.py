@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.growth import retriangulate
-from fieldstone.mapping.growth_memory import GrowthMemory
-from fieldstone.mapping.incremental import LADDER, GrownModel, IncrementalOptions, collapsed, grow
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.incremental.checkpoint import GrowthMemory
+from fieldstone.mapping.incremental.mapper import LADDER, GrownModel, IncrementalOptions, collapsed, grow
+from fieldstone.mapping.model.triangulation import retriangulate
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import build_tracks
 

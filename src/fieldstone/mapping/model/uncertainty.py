@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fieldstone.geometry.rotation import skew
-from fieldstone.mapping.calibration import priors
-from fieldstone.mapping.record import Uncertainty
-from fieldstone.mapping.refinement import Calibration, RefinementOptions, bundle_problem
-from fieldstone.mapping.working_model import WorkingModel, reprojections
+from fieldstone.mapping.model.calibration import priors
+from fieldstone.mapping.model.refinement import Calibration, RefinementOptions, bundle_problem
+from fieldstone.mapping.model.working_model import WorkingModel, reprojections
+from fieldstone.scene.mapping_run import Uncertainty
 from fieldstone.solve.bundle.adjustment import BundleOptions
 from fieldstone.solve.bundle.covariance import bundle_covariance
 from fieldstone.solve.robust.loss import RobustLoss, cauchy, huber, soft_l1, trivial

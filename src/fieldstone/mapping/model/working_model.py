@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.record import StageRecord
+from fieldstone.scene.mapping_run import StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations, compact_points

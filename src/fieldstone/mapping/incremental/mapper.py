@@ -11,14 +11,14 @@ from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.calibration import CalibrationStep
-from fieldstone.mapping.growth import retriangulate, tracks_of_view
-from fieldstone.mapping.growth_memory import GrowthMemory, GrowthState, Kept, as_found_again, name_of_growth
-from fieldstone.mapping.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
-from fieldstone.mapping.registration import Start, contradicts_pairs, rank_starts, register_view
-from fieldstone.mapping.structureless import pose_from_partners
-from fieldstone.mapping.view_selection import next_views
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.incremental.checkpoint import GrowthMemory, GrowthState, Kept, as_found_again, name_of_growth
+from fieldstone.mapping.incremental.registration import Start, contradicts_pairs, rank_starts, register_view
+from fieldstone.mapping.incremental.structureless import pose_from_partners
+from fieldstone.mapping.incremental.view_selection import next_views
+from fieldstone.mapping.model.calibration import CalibrationStep
+from fieldstone.mapping.model.refinement import RefinementOptions, adjust, adjust_around, refine_until_stable
+from fieldstone.mapping.model.triangulation import retriangulate, tracks_of_view
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.robust.ransac import RansacOptions

@@ -17,9 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rotation import exp, log
-from fieldstone.mapping.conflicts import find_conflicts
-from fieldstone.mapping.record import MappingRun
-from fieldstone.mapping.rotation_forest import (
+from fieldstone.mapping.disambiguation.missing_correspondences import find_conflicts
+from fieldstone.mapping.disambiguation.rotation_forest import (
     AGREE,
     Evidence,
     Forest,
@@ -29,6 +28,7 @@ from fieldstone.mapping.rotation_forest import (
     tree_of_most_inliers,
     turn_angles,
 )
+from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.solve.robust.two_view import degenerate

@@ -12,8 +12,8 @@ from fieldstone.geometry.camera import plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
 from fieldstone.geometry.triangulation import in_front_of_both, triangulate_linear, triangulation_angles
-from fieldstone.mapping.rotation_forest import AGREE
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.disambiguation.rotation_forest import AGREE
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose
 from fieldstone.solve.robust.ransac import RansacOptions

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.calibration import CalibrationStep, priors, with_models
-from fieldstone.mapping.growth import covering_tracks, retriangulate
-from fieldstone.mapping.working_model import WorkingModel, reprojections
+from fieldstone.mapping.model.calibration import CalibrationStep, priors, with_models
+from fieldstone.mapping.model.triangulation import covering_tracks, retriangulate
+from fieldstone.mapping.model.working_model import WorkingModel, reprojections
 from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle.problem import BundleProblem
 

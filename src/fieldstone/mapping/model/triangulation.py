@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.solve.projection.undistortion import plane_from_images
 from fieldstone.solve.robust.triangulation import triangulate_robust
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import MatchGraph
 
 logger = logging.getLogger(__name__)

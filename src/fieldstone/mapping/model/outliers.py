@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.geometry.triangulation import triangulate_tracks_linear
-from fieldstone.mapping.growth import plane_coordinates
-from fieldstone.mapping.record import Drop, StageRecord
-from fieldstone.mapping.working_model import WorkingModel, record_views, reprojections
+from fieldstone.mapping.model.triangulation import plane_coordinates
+from fieldstone.mapping.model.working_model import WorkingModel, record_views, reprojections
+from fieldstone.scene.mapping_run import Drop, StageRecord
 from fieldstone.solve.robust.loss import soft_l1
 from fieldstone.solve.robust.nonlinear import triangulate_nonlinear
 

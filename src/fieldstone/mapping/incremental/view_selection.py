@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.working_model import WorkingModel
+from fieldstone.mapping.model.working_model import WorkingModel
 
 LEVELS = 6
 CANDIDATES = 8

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import bdtr
 
-from fieldstone.mapping.conflicts import Conflict
+from fieldstone.mapping.disambiguation.missing_correspondences import Conflict
 from fieldstone.scene.match_graph import ImagePair
 
 AGREE = float(np.deg2rad(15.0))

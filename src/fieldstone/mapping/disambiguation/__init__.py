@@ -1,0 +1,1 @@
+"""Pairs that match without showing the same place."""

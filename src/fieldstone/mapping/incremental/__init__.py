@@ -1,0 +1,1 @@
+"""Incremental registration: from an initial pair, photo by photo."""
