@@ -19,15 +19,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldstone.field.fast_decoder import HIDDEN
-from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
-from fieldstone.field.fast_exposure import gains_of
-from fieldstone.field.fast_field import FOREVER
-from fieldstone.field.fast_grid_numba import add_gradient, step_by_sample, step_touched
-from fieldstone.field.fast_march_numba import composite_backward, march_rays
-from fieldstone.field.fast_plan import plan_from_json
-from fieldstone.field.fast_step_numba import draw_rays
-from fieldstone.field.fast_training import FastState, FastTraining, fast_training
+from fieldstone.field.grid.decoder import HIDDEN
+from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
+from fieldstone.field.grid.exposure import gains_of
+from fieldstone.field.grid.field import FOREVER
+from fieldstone.field.grid.interpolation_numba import add_gradient, step_by_sample, step_touched
+from fieldstone.field.grid.march_numba import composite_backward, march_rays
+from fieldstone.field.grid.step_numba import draw_rays
+from fieldstone.field.grid_training.plan import plan_from_json
+from fieldstone.field.grid_training.training import FastState, FastTraining, fast_training
 from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.pipeline.fast_fields import MAX_SIZE_PX, train_fast_run
 from fieldstone.pipeline.field_input import read_ray_dataset

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldstone.field.fast_field import field_from_tensors, renderer
-from fieldstone.field.radiance_field import in_world
-from fieldstone.field.training import PRESETS, train
+from fieldstone.field.base.radiance_field import in_world
+from fieldstone.field.base.training import PRESETS, train
+from fieldstone.field.grid.field import field_from_tensors, renderer
 from fieldstone.io.checkpoint import read_checkpoint
 from fieldstone.pipeline.field_input import read_ray_dataset
 from fieldstone.pipeline.field_mesh import compared_views

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from fieldstone.field.fast_decoder import decoder_width, initial_decoder
-from fieldstone.field.fast_field import FastField
-from fieldstone.field.fast_grid import grid_layout
-from fieldstone.field.occupancy import full_box
-from fieldstone.field.projection import no_projection
-from fieldstone.field.radiance_field import FieldFrame
-from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.field.base.projection import no_projection
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import PosedImage
+from fieldstone.field.grid.decoder import decoder_width, initial_decoder
+from fieldstone.field.grid.field import FastField
+from fieldstone.field.grid.layout import grid_layout
+from fieldstone.field.grid.occupancy import full_box
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.render.camera_paths import look_at

@@ -7,8 +7,8 @@ from benchmarks.blender_house import blender_matrix, direction
 from benchmarks.field import kernel_times
 
 from fast_scenes import FRAME, ball_images
-from fieldstone.field.fast_plan import FastPlan
-from fieldstone.field.fast_training import fast_training
+from fieldstone.field.grid_training.plan import FastPlan
+from fieldstone.field.grid_training.training import fast_training
 from fieldstone.synthetic.light import look_at
 
 

@@ -12,7 +12,7 @@ from fieldstone.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fieldstone.field.training import CurvePoint
+    from fieldstone.field.base.training import CurvePoint
 
 # Heavy imports live in the verbs, so that help and usage errors come at once.
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA
-from fieldstone.field.black_border import kept_inside_borders
-from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.field.base.ray_dataset import PosedImage
+from fieldstone.field.evidence.borders import kept_inside_borders
 from fieldstone.geometry.rigid3 import Rigid3
 
 SHAPE = (CAMERA.height, CAMERA.width, 3)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.encodings import encoded_size, frequency_encoding
+from fieldstone.field.nerf.encodings import encoded_size, frequency_encoding
 
 
 def test_values_of_the_definition():

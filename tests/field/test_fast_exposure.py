@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.fast_exposure import gain_at, gains_of, step_exposure, unit_exposure
+from fieldstone.field.grid.exposure import gain_at, gains_of, step_exposure, unit_exposure
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render.camera_paths import look_at
 

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from fast_scenes import random_field, random_rays
-from fieldstone.field.fast_decoder import HIDDEN, Decoder, decode
-from fieldstone.field.fast_decoder_numba import decode_backward, decode_directions, decode_numba
-from fieldstone.field.fast_field import FOREVER, renderer, room_for_samples
-from fieldstone.field.fast_grid import interpolate
-from fieldstone.field.fast_grid_numba import BLOCK, add_gradient
-from fieldstone.field.fast_march_numba import Samples, composite_backward, march_rays
-from fieldstone.field.fast_terms_numba import PointRays, point_terms
-from fieldstone.field.known_points import no_known_rays
-from fieldstone.field.volume_rendering import composite
+from fieldstone.field.base.volume_rendering import composite
+from fieldstone.field.evidence.sparse_depth import no_known_rays
+from fieldstone.field.grid.decoder import HIDDEN, Decoder, decode
+from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
+from fieldstone.field.grid.field import FOREVER, renderer, room_for_samples
+from fieldstone.field.grid.interpolation_numba import BLOCK, add_gradient
+from fieldstone.field.grid.layout import interpolate
+from fieldstone.field.grid.march_numba import Samples, composite_backward, march_rays
+from fieldstone.field.grid.terms_numba import PointRays, point_terms
 from fieldstone.scene.rays import Rays
 
 ROOM = 4096
@@ -127,7 +127,7 @@ def point_loss(points, samples, n, step, weight, free_weight) -> np.ndarray:
 )
 def test_gradients_match_autograd(case, sparsity, point_weight, emptiness, free_weight):
     torch = pytest.importorskip("torch")
-    from fieldstone.field.torch_field import optical_depths, packed_colors, packed_weights, torch_fast_field
+    from fieldstone.field.grid_torch.field import optical_depths, packed_colors, packed_weights, torch_fast_field
 
     field, _, directions, target, background = case
     bare = torch.arange(60) % 3 == 0

@@ -1,9 +1,15 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.fast_grid import CHANNELS, grid_layout, interpolate, level_resolutions
-from fieldstone.field.fast_grid_numba import BLOCK, add_gradient, interpolate_numba, step_by_sample, step_touched
-from fieldstone.field.fast_update import WORD
+from fieldstone.field.grid.interpolation_numba import (
+    BLOCK,
+    add_gradient,
+    interpolate_numba,
+    step_by_sample,
+    step_touched,
+)
+from fieldstone.field.grid.layout import CHANNELS, grid_layout, interpolate, level_resolutions
+from fieldstone.field.grid_training.update import WORD
 
 EXTENT = np.array([2.0, 1.3, 0.9])
 RESOLUTIONS = (4, 8, 16)

@@ -8,13 +8,13 @@ import pytest
 from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_field import compress, expand, field_from_tensors, occupancy_box, reachable_vertices
-from fieldstone.field.fast_plan import FastPlan, corrected, plan_for_budget, plan_from_json
-from fieldstone.field.fast_rays import coprime_stride, pixels_that_hit
-from fieldstone.field.fast_training import FastTraining, fast_training
-from fieldstone.field.occupancy import Occupancy
-from fieldstone.field.occupancy_numba import rays_that_hit
-from fieldstone.field.radiance_field import FieldTraining
+from fieldstone.field.base.radiance_field import FieldTraining
+from fieldstone.field.grid.field import compress, expand, field_from_tensors, occupancy_box, reachable_vertices
+from fieldstone.field.grid.occupancy import Occupancy
+from fieldstone.field.grid.occupancy_numba import rays_that_hit
+from fieldstone.field.grid.rays import coprime_stride, pixels_that_hit
+from fieldstone.field.grid_training.plan import FastPlan, corrected, plan_for_budget, plan_from_json
+from fieldstone.field.grid_training.training import FastTraining, fast_training
 from fieldstone.geometry.camera import Camera, bearings_from_image
 from fieldstone.scene.rays import pixel_centers, rays_from_view
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.floaters import places_in_box, without_floaters
-from fieldstone.field.free_space import corners_in_world
-from fieldstone.field.occupancy import Occupancy, full_box
-from fieldstone.field.projection import no_projection
-from fieldstone.field.radiance_field import FieldFrame
+from fieldstone.field.base.projection import no_projection
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.evidence.floaters import places_in_box, without_floaters
+from fieldstone.field.evidence.free_space import corners_in_world
+from fieldstone.field.grid.occupancy import Occupancy, full_box
 from fieldstone.geometry.sim3 import Sim3
 
 SPECK, THING, WALL = (slice(8, 10),) * 3, (slice(8, 12), slice(14, 17), slice(12, 14)), (0, slice(4, 20), slice(4, 20))

@@ -5,11 +5,17 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME
-from fieldstone.field.floaters import places_in_box
-from fieldstone.field.free_space import FREE_SHARE, PROBABLE_SHARE, carve_free_space, corners_in_world, probably_free
-from fieldstone.field.occupancy import full_box
-from fieldstone.field.projection import no_projection, project_points, projection_for
-from fieldstone.field.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.base.projection import no_projection, project_points, projection_for
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.evidence.floaters import places_in_box
+from fieldstone.field.evidence.free_space import (
+    FREE_SHARE,
+    PROBABLE_SHARE,
+    carve_free_space,
+    corners_in_world,
+    probably_free,
+)
+from fieldstone.field.grid.occupancy import full_box
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3

@@ -7,9 +7,9 @@ import threading
 import numpy as np
 import pytest
 
-from fieldstone.field.interrupts import deferred_interrupts
-from fieldstone.field.radiance_field import StepReport
-from fieldstone.field.training import train
+from fieldstone.field.base.interrupts import deferred_interrupts
+from fieldstone.field.base.radiance_field import StepReport
+from fieldstone.field.base.training import train
 
 
 def press():

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
-from fieldstone.field.known_points import known_rays, seen_points
-from fieldstone.field.projection import no_projection, project_rays, projection_for, unproject_points
-from fieldstone.field.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.projection import no_projection, project_rays, projection_for, unproject_points
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.evidence.sparse_depth import known_rays, seen_points
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render.camera_paths import look_at

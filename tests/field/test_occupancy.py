@@ -5,9 +5,9 @@ import pytest
 from numba import njit
 
 from fast_scenes import CAMERA, RADIUS, ball_images
-from fieldstone.field.fast_field import occupancy_box
-from fieldstone.field.fast_march_numba import distance_at
-from fieldstone.field.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
+from fieldstone.field.grid.field import occupancy_box
+from fieldstone.field.grid.march_numba import distance_at
+from fieldstone.field.grid.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.05, 1.0])

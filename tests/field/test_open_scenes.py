@@ -8,12 +8,12 @@ import pytest
 
 from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_field import occupancy_box
-from fieldstone.field.fast_plan import FastPlan
-from fieldstone.field.fast_rays import ray_table
-from fieldstone.field.fast_training import FastTraining, fast_training
-from fieldstone.field.occupancy import full_box
-from fieldstone.field.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.grid.field import occupancy_box
+from fieldstone.field.grid.occupancy import full_box
+from fieldstone.field.grid.rays import ray_table
+from fieldstone.field.grid_training.plan import FastPlan
+from fieldstone.field.grid_training.training import FastTraining, fast_training
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.scene.rays import rays_from_view
 

@@ -5,11 +5,17 @@ import numpy as np
 import pytest
 
 from fast_scenes import FRAME, ball_images
-from fieldstone.field.fast_plan import FastPlan
-from fieldstone.field.fast_training import fast_training
-from fieldstone.field.pose_refinement import MovablePhoto, movable_photos, moved_images, pixels_by_pose, refined
-from fieldstone.field.radiance_field import RenderedRays
-from fieldstone.field.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.radiance_field import RenderedRays
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.evidence.pose_refinement import (
+    MovablePhoto,
+    movable_photos,
+    moved_images,
+    pixels_by_pose,
+    refined,
+)
+from fieldstone.field.grid_training.plan import FastPlan
+from fieldstone.field.grid_training.training import fast_training
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render.camera_paths import look_at

@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME
-from fieldstone.field.fast_step_numba import project_ray_numba
-from fieldstone.field.projection import (
+from fieldstone.field.base.projection import (
     distance_along,
     project_points,
     project_rays,
     projection_for,
     unproject_points,
 )  # fmt: skip
-from fieldstone.field.ray_dataset import PosedImage
+from fieldstone.field.base.ray_dataset import PosedImage
+from fieldstone.field.grid.step_numba import project_ray_numba
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
 from fieldstone.render.camera_paths import look_at

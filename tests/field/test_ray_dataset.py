@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.field.radiance_field import FieldFrame, RenderedRays, in_world
-from fieldstone.field.ray_dataset import (
+from fieldstone.field.base.radiance_field import FieldFrame, RenderedRays, in_world
+from fieldstone.field.base.ray_dataset import (
     PosedImage,
     RayDataset,
     area_weights,

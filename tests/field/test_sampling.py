@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.sampling import PDF_FLOOR, hierarchical, inverse_cdf, stratified
+from fieldstone.field.nerf.sampling import PDF_FLOOR, hierarchical, inverse_cdf, stratified
 
 
 def test_stratified_midpoints_are_equally_spaced():

@@ -8,31 +8,31 @@ import pytest
 
 from fast_scenes import CAMERA, FRAME, RADIUS, ball_image, ball_images, random_field, random_rays
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_decoder import Decoder
-from fieldstone.field.fast_exposure import Exposure
-from fieldstone.field.fast_field import FOREVER, field_from_tensors, renderer, room_for_samples
-from fieldstone.field.fast_march_numba import march_rays
-from fieldstone.field.fast_plan import FastPlan
-from fieldstone.field.fast_step_numba import GRADIENT_SCALE
-from fieldstone.field.fast_terms_numba import Terms
-from fieldstone.field.fast_training import fast_training
-from fieldstone.field.occupancy import Occupancy
-from fieldstone.field.radiance_field import FieldTraining
-from fieldstone.field.ray_dataset import SeenPoints
+from fieldstone.field.base.radiance_field import FieldTraining
+from fieldstone.field.base.ray_dataset import SeenPoints
+from fieldstone.field.grid.decoder import Decoder
+from fieldstone.field.grid.exposure import Exposure
+from fieldstone.field.grid.field import FOREVER, field_from_tensors, renderer, room_for_samples
+from fieldstone.field.grid.march_numba import march_rays
+from fieldstone.field.grid.occupancy import Occupancy
+from fieldstone.field.grid.step_numba import GRADIENT_SCALE
+from fieldstone.field.grid.terms_numba import Terms
+from fieldstone.field.grid_training.plan import FastPlan
+from fieldstone.field.grid_training.training import fast_training
 from fieldstone.scene.rays import rays_from_view
 
 torch = pytest.importorskip("torch")
 
-from fieldstone.field.torch_fast_training import TorchFastTraining, TorchRays, step_gradient  # noqa: E402
-from fieldstone.field.torch_field import (  # noqa: E402
+from fieldstone.field.grid_torch.field import (  # noqa: E402
     depths_before,
     optical_depths,
     packed_colors,
     packed_weights,
     torch_fast_field,
 )
-from fieldstone.field.torch_grid import torch_grid  # noqa: E402
-from fieldstone.field.torch_march import march_packed, torch_box  # noqa: E402
+from fieldstone.field.grid_torch.layout import torch_grid  # noqa: E402
+from fieldstone.field.grid_torch.march import march_packed, torch_box  # noqa: E402
+from fieldstone.field.grid_torch.training import TorchFastTraining, TorchRays, step_gradient  # noqa: E402
 
 CPU = torch.device("cpu")
 

@@ -3,15 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fieldstone.field.encodings import encoded_size
-from fieldstone.field.radiance_field import FieldFrame
-from fieldstone.field.ray_dataset import blender_frame
-from fieldstone.field.training import NERF, TINY
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import blender_frame
+from fieldstone.field.base.training import NERF, TINY
+from fieldstone.field.nerf.encodings import encoded_size
 from fieldstone.geometry.sim3 import Sim3
 
 torch = pytest.importorskip("torch")
 
-from fieldstone.field.torch_nerf import (  # noqa: E402
+from fieldstone.field.nerf.networks import (  # noqa: E402
     density_and_color,
     initial_parameters,
     layer_sizes,

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
-from fieldstone.field import encodings, sampling, volume_rendering
+from fieldstone.field.base import volume_rendering
+from fieldstone.field.nerf import encodings, sampling
 
 torch = pytest.importorskip("torch")
 
-from fieldstone.field import torch_rendering  # noqa: E402
+from fieldstone.field.nerf import rendering as torch_rendering  # noqa: E402
 
 
 def random_samples(seed=0, r=5, s=9):

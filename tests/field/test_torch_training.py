@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.field.radiance_field import FieldFrame
-from fieldstone.field.ray_dataset import PosedImage, training_rays
-from fieldstone.field.training import NERF, PRESETS, TINY, TrainOptions, train
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import PosedImage, training_rays
+from fieldstone.field.base.training import NERF, PRESETS, TINY, TrainOptions, train
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.render.camera_paths import look_at
@@ -15,8 +15,8 @@ from fieldstone.scene.rays import Rays, rays_from_view
 
 torch = pytest.importorskip("torch")
 
-from fieldstone.field import torch_training  # noqa: E402
-from fieldstone.field.torch_training import TorchTraining, adam, torch_device, torch_workers  # noqa: E402
+from fieldstone.field.nerf import training as torch_training  # noqa: E402
+from fieldstone.field.nerf.training import TorchTraining, adam, torch_device, torch_workers  # noqa: E402
 
 SMALL_TINY = replace(TINY, width=16, position_frequencies=3, direction_frequencies=2, num_samples=8)
 SMALL_NERF = replace(

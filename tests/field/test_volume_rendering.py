@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.sampling import stratified
-from fieldstone.field.volume_rendering import composite, interval_lengths, ray_weights
+from fieldstone.field.base.volume_rendering import composite, interval_lengths, ray_weights
+from fieldstone.field.nerf.sampling import stratified
 from fieldstone.synthetic.analytic_field import Ball, GaussianBlob, Slab
 
 NEAR, FAR = 2.0, 6.0

@@ -9,7 +9,7 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr, ssim
-from fieldstone.field.training import PRESETS, TINY
+from fieldstone.field.base.training import PRESETS, TINY
 from fieldstone.geometry.camera import Camera
 from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.colmap import write_colmap
@@ -271,7 +271,7 @@ def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
 def test_without_torch_the_way_out_is_named(tmp_path, monkeypatch):
     source = write_blender_folder(tmp_path / "in")
     monkeypatch.setitem(sys.modules, "torch", None)
-    for name in [name for name in sys.modules if name.startswith("fieldstone.field.torch_")]:
+    for name in [name for name in sys.modules if name.startswith("fieldstone.field.nerf.")]:
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(InputError, match=r"pip install 'fieldstone\[torch\]'"):
         train_run(source, tmp_path / "out", max_steps=1)

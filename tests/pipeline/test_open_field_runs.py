@@ -9,7 +9,7 @@ from fast_scenes import CAMERA, RADIUS, ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.fast_plan import first_plan
+from fieldstone.field.grid_training.plan import first_plan
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.io.colmap import write_colmap
 from fieldstone.io.photos import read_photo, write_photo

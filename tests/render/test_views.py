@@ -1,6 +1,6 @@
 import numpy as np
 
-from fieldstone.field.radiance_field import RenderedRays, surface_depth
+from fieldstone.field.base.radiance_field import RenderedRays, surface_depth
 from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3

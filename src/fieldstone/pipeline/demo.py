@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldstone.field.training import OnStep
+from fieldstone.field.base.training import OnStep
 from fieldstone.io.atomic import write_json
 from fieldstone.io.colmap import find_colmap_model, read_colmap
 from fieldstone.pipeline.fast_fields import train_fast_run

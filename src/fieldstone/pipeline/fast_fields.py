@@ -20,8 +20,11 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
-from fieldstone.field.fast_exposure import gain_at
-from fieldstone.field.fast_plan import (
+from fieldstone.field.base.radiance_field import FieldFrame, FieldTraining, in_world
+from fieldstone.field.base.ray_dataset import PosedImage, RayDataset, reduce_image
+from fieldstone.field.base.training import CurvePoint, OnStep
+from fieldstone.field.grid.exposure import gain_at
+from fieldstone.field.grid_training.plan import (
     STAGE_SHARES,
     FastPlan,
     finest_for,
@@ -29,10 +32,7 @@ from fieldstone.field.fast_plan import (
     plan_for_budget,
     plan_from_json,
 )  # fmt: skip
-from fieldstone.field.fast_training import FastTraining, fast_training
-from fieldstone.field.radiance_field import FieldFrame, FieldTraining, in_world
-from fieldstone.field.ray_dataset import PosedImage, RayDataset, reduce_image
-from fieldstone.field.training import CurvePoint, OnStep
+from fieldstone.field.grid_training.training import FastTraining, fast_training
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
@@ -197,8 +197,8 @@ def steps_on(device: str) -> StepsBy:
     if device == "cpu":
         return lambda training: training
     with torch_for(f"the fast field on {device}"):
-        from fieldstone.field.torch_fast_training import TorchFastTraining
-        from fieldstone.field.torch_training import torch_device
+        from fieldstone.field.grid_torch.training import TorchFastTraining
+        from fieldstone.field.nerf.training import torch_device
     found = torch_device(device)
     logger.warning("training on %s: this way was tested on torch's CPU device only, never on a GPU", device)
     return lambda training: TorchFastTraining(training, found)

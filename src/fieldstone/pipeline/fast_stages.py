@@ -10,11 +10,11 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from fieldstone.field.fast_exposure import Exposure
-from fieldstone.field.fast_plan import FastPlan, corrected
-from fieldstone.field.interrupts import deferred_interrupts
-from fieldstone.field.radiance_field import FieldTraining
-from fieldstone.field.training import CurvePoint, OnStep, train
+from fieldstone.field.base.interrupts import deferred_interrupts
+from fieldstone.field.base.radiance_field import FieldTraining
+from fieldstone.field.base.training import CurvePoint, OnStep, train
+from fieldstone.field.grid.exposure import Exposure
+from fieldstone.field.grid_training.plan import FastPlan, corrected
 
 logger = logging.getLogger(__name__)
 

@@ -12,10 +12,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from fieldstone.errors import InputError
-from fieldstone.field.black_border import kept_inside_borders
-from fieldstone.field.known_points import seen_points
-from fieldstone.field.radiance_field import FieldFrame
-from fieldstone.field.ray_dataset import (
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import (
     PosedImage,
     RayDataset,
     SeenPoints,
@@ -27,6 +25,8 @@ from fieldstone.field.ray_dataset import (
     reduce_images,
     split_every,
 )
+from fieldstone.field.evidence.borders import kept_inside_borders
+from fieldstone.field.evidence.sparse_depth import seen_points
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender

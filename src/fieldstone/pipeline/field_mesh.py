@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.field.fast_field import FastField, field_from_tensors, renderer
-from fieldstone.field.projection import project_points, unproject_points
-from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world, surface_depth
+from fieldstone.field.base.projection import project_points, unproject_points
+from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_world, surface_depth
+from fieldstone.field.grid.field import FastField, field_from_tensors, renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.atomic import write_json

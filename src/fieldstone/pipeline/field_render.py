@@ -14,9 +14,9 @@ from jaxtyping import Float, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
-from fieldstone.field.fast_field import field_from_tensors, renderer
-from fieldstone.field.radiance_field import FieldFrame, RayRenderer, in_world
-from fieldstone.field.training import TrainOptions
+from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_world
+from fieldstone.field.base.training import TrainOptions
+from fieldstone.field.grid.field import field_from_tensors, renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.camera_path_json import read_camera_path

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from fieldstone.evaluate.image_metrics import psnr, quantize
-from fieldstone.field.fast_decoder import decode
-from fieldstone.field.fast_field import FastField, renderer
-from fieldstone.field.fast_grid_numba import interpolate_numba
-from fieldstone.field.projection import project_points
-from fieldstone.field.radiance_field import FieldFrame, in_world
+from fieldstone.field.base.projection import project_points
+from fieldstone.field.base.radiance_field import FieldFrame, in_world
+from fieldstone.field.grid.decoder import decode
+from fieldstone.field.grid.field import FastField, renderer
+from fieldstone.field.grid.interpolation_numba import interpolate_numba
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.atomic import write_json
 from fieldstone.io.splats import write_splats

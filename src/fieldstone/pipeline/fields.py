@@ -21,9 +21,9 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import PROTOCOL, psnr, quantize, ssim
-from fieldstone.field.radiance_field import FieldFrame, FieldTraining, RayRenderer, in_world
-from fieldstone.field.ray_dataset import PosedImage, RayDataset, training_rays
-from fieldstone.field.training import PRESETS, CurvePoint, OnStep, TrainOptions, train
+from fieldstone.field.base.radiance_field import FieldFrame, FieldTraining, RayRenderer, in_world
+from fieldstone.field.base.ray_dataset import PosedImage, RayDataset, training_rays
+from fieldstone.field.base.training import PRESETS, CurvePoint, OnStep, TrainOptions, train
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
@@ -145,7 +145,7 @@ def open_training(
         InputError: torch is not installed, or the device is not there.
     """
     with torch_for(f"the {options.network} network"):
-        from fieldstone.field.torch_training import TorchTraining, torch_device, torch_workers
+        from fieldstone.field.nerf.training import TorchTraining, torch_device, torch_workers
     rays = None if dataset is None else training_rays(dataset.train, frame)
     with torch_workers(threads) as workers:
         yield TorchTraining(options, frame, rays, seed, torch_device(device), workers)

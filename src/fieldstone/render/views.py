@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.field.radiance_field import RayRenderer, surface_depth
+from fieldstone.field.base.radiance_field import RayRenderer, surface_depth
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.rays import Rays, rays_from_view

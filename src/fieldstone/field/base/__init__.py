@@ -1,0 +1,1 @@
+"""What all fields share: rays to learn from, the loop of training, volume rendering."""

@@ -1,0 +1,1 @@
+"""What photos and known points say of a scene besides colour."""

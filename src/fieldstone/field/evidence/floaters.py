@@ -1,0 +1,74 @@
+"""What hangs in the air: solid pieces that touch nothing else and hold no known point.
+
+A field with few photos explains some pixels by a speck that only one photo looks at, and goes on refining it: longer
+training makes it worse. A real thing mostly stands on something, or has texture, and then known points.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import label
+
+from fieldstone.field.base.projection import Projection, project_points
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
+from fieldstone.field.grid.occupancy import Occupancy, grown_by_one
+
+MOST_FLOATING = 0.3
+"""If more of what is solid were to go than this share, the points do not speak for the scene."""
+
+CORNERS_TOO = np.ones((3, 3, 3))
+"""Cells that share a corner touch."""
+
+
+def places_in_box(
+    points: Float[np.ndarray, "p 3"], projection: Projection, *, unbounded: bool
+) -> Float[np.ndarray, "p 3"]:
+    """Where points of the frame lie in the space of the grids.
+
+    Args:
+        unbounded: What is beyond the box is contracted, see `fast_march_numba.Box`.
+    """
+    if projection.active:
+        return project_points(projection, points)
+    if not unbounded:
+        return points
+    reach = np.maximum(np.abs(points).max(axis=1, keepdims=True) / NORMALIZED_RADIUS, 1.0)
+    return points / reach * (2.0 - 1.0 / reach)
+
+
+def without_floaters(
+    occupancy: Occupancy,
+    solid: Bool[np.ndarray, "x y z"],
+    places: Float[np.ndarray, "p 3"],
+    *,
+    unbounded: bool,
+) -> Occupancy:
+    """The occupancy without the pieces of solid cells that are tied to nothing, and without the rim around them.
+
+    A piece is tied if there is a known point in it or beside it, or if it reaches the contracted surroundings: what is
+    far away is often seen without any point on it. Where `MOST_FLOATING` is exceeded, everything stays.
+
+    Args:
+        places: Of known points, see `places_in_box`.
+    """
+    shape = np.array(solid.shape)
+    cell = np.floor((places - occupancy.lower) / occupancy.cell_size)
+    cell = cell[np.all((cell >= 0) & (cell < shape), axis=1)].astype(np.int64)  # nan is not inside
+    ties = np.zeros(solid.shape, dtype=bool)
+    ties[tuple(cell.T)] = True
+    ties = grown_by_one(ties)
+    if unbounded:
+        inner = np.zeros_like(ties)
+        inner[tuple(slice(n // 4, n - n // 4) for n in solid.shape)] = True
+        ties |= ~inner
+    pieces = np.empty(solid.shape, dtype=np.int32)
+    label(solid, CORNERS_TOO, output=pieces)
+    tied = np.zeros(int(pieces.max()) + 1, dtype=bool)
+    tied[pieces[ties]] = True
+    tied[0] = False
+    kept = tied[pieces]
+    floating = solid & ~kept
+    if np.count_nonzero(floating) > MOST_FLOATING * np.count_nonzero(solid):
+        return occupancy
+    return Occupancy(occupancy.lower, occupancy.cell_size, occupancy.cells & ~(grown_by_one(floating) & ~kept))

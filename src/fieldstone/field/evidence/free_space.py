@@ -1,0 +1,171 @@
+"""Space that the photos look through: what lies well in front of the nearest known points of a photo is empty.
+
+Without it, a field explains the photos best by a coloured cloud right in front of each camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+
+import numpy as np
+from jaxtyping import Float, Shaped
+from scipy.spatial import KDTree
+
+from fieldstone.field.base.projection import Projection, unproject_points
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.grid.occupancy import Occupancy
+from fieldstone.geometry.camera import image_from_cam
+from fieldstone.scene.rays import pixel_centers
+
+FREE_SHARE = 0.7
+"""Space is empty up to this share of the distance of known points: what has none may stand before them."""
+
+PROBABLE_SHARE = 0.92
+"""And probably up to this share of the least distance of the points around."""
+
+NEIGHBOURS = 8
+"""Known points in a photo that speak for the pixels near them."""
+
+BLOCKS = 48
+"""They are found for so many blocks along the longer side of the photo."""
+
+FARTHEST = 1e4
+"""What is further away, in units of the frame, is at infinity."""
+
+MIN_PHOTOS, MANY_PHOTOS = 3, 8
+"""What is nearer to a photo than most of its points is seen by so many photos, if there are so many; else by 2."""
+
+NEAR_PERCENT = 90.0
+"""Percentile of the distances of its points up to which a place is near to a photo."""
+
+AROUND_PERCENT = 5.0
+"""Up to `FREE_SHARE` of this percentile of the distances of its points, a place is around a photo."""
+
+MIN_SEEN = 20
+"""Fewer points of a photo say nothing of its space."""
+
+
+def carve_free_space(
+    occupancy: Occupancy,
+    images: Sequence[PosedImage],
+    frame: FieldFrame,
+    seen: Mapping[str, SeenPoints],
+    projection: Projection,
+    executor: Executor,
+    *,
+    unbounded: bool,
+) -> Occupancy:
+    """The occupancy without cells that photos look through.
+
+    A cell is empty if all its corners lie in front of the known points around them in one photo, or if it is nearer
+    to a photo than most of its points are and too few photos see it: nothing but this photo would say what is there,
+    and anything it shows could be put there. Around a camera, that holds for the cells that no photo sees as well: no
+    photo would ever correct what the coarse grids spread into them, and a new view may look through them.
+
+    Args:
+        seen: By name of the photo, in the world.
+        unbounded: What is beyond the box is contracted.
+    """
+    corners = corners_in_world(occupancy, frame, projection, unbounded=unbounded)
+    places, shape = corners.reshape(-1, 3), corners.shape[:3]
+
+    def of_photo(image: PosedImage) -> tuple[np.ndarray, ...]:
+        """Cells that are free, that the photo sees, that it sees from near, that it sees a part of, and around it."""
+        away = np.linalg.norm(places - image.cam_from_world.target_origin_in_source(), axis=1)
+        pixels = image_from_cam(image.camera, image.cam_from_world.apply(places))
+        # nan, behind the camera, is not inside.
+        inside = np.all((pixels >= 0) & (pixels <= [image.camera.width, image.camera.height]), axis=1)
+        free, near, around = np.zeros((3, len(places)), dtype=bool)
+        points = seen.get(image.name)
+        if points is not None and len(points.xyz) >= MIN_SEEN:
+            distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
+            free[inside] = away[inside] < FREE_SHARE * least_distance(image, points.xyz, distances, pixels[inside])
+            near = inside & (away < np.percentile(distances, NEAR_PERCENT))
+            around = away < FREE_SHARE * np.percentile(distances, AROUND_PERCENT)
+        # A photo may see a part of a cell, but none of its corners.
+        spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
+        (left, right), (top, bottom) = spans
+        part = (right >= 0) & (left <= image.camera.width) & (bottom >= 0) & (top <= image.camera.height)
+        some = [of_corners(flags, np.logical_or) for flags in (inside, near)]
+        return of_corners(free, np.logical_and), *some, part, of_corners(around, np.logical_and)
+
+    def of_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+        return _of_corners(values.reshape(shape), combine)
+
+    cells = occupancy.cells.copy()
+    times_seen = np.zeros(cells.shape, dtype=np.int32)
+    near_some, parts_seen, around_some = np.zeros((3, *cells.shape), dtype=bool)
+    for free, visible, near, part, around in executor.map(of_photo, images):
+        cells &= ~free
+        times_seen += visible
+        near_some |= near
+        parts_seen |= part
+        around_some |= around
+    cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(images) >= MANY_PHOTOS else 2)))
+    cells &= ~around_some | parts_seen
+    return Occupancy(occupancy.lower, occupancy.cell_size, cells)
+
+
+def probably_free(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable[[PosedImage], Float[np.ndarray, "p"]]:
+    """How far every pixel of a photo probably sees, in the frame; 0 where too little is known.
+
+    Unlike in `carve_free_space`, something may stand there: the distance is nearly that of the points around it.
+    """
+
+    def of_photo(image: PosedImage) -> Float[np.ndarray, "p"]:
+        camera, points = image.camera, seen.get(image.name)
+        if points is None or len(points.xyz) < MIN_SEEN:
+            return np.zeros(camera.width * camera.height, dtype=np.float32)
+        distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
+        least = least_distance(image, points.xyz, distances, pixel_centers(camera.width, camera.height))
+        return (PROBABLE_SHARE * frame.normalized_from_world.scale * least).astype(np.float32)
+
+    return of_photo
+
+
+def least_distance(
+    image: PosedImage,
+    points: Float[np.ndarray, "p 3"],
+    distances: Float[np.ndarray, "p"],
+    pixels: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, "n"]:
+    """Of the `NEIGHBOURS` known points that are nearest to each pixel in the photo, how far the nearest one is.
+
+    Args:
+        points: In the world; distances: from the camera.
+    """
+    size = np.array([image.camera.width, image.camera.height])
+    block = size.max() / BLOCKS
+    centers = np.stack(np.meshgrid(*(np.arange(np.ceil(n / block)) for n in size), indexing="ij"), axis=-1)
+    tree = KDTree(image_from_cam(image.camera, image.cam_from_world.apply(points)))
+    _, nearest = tree.query((centers.reshape(-1, 2) + 0.5) * block, k=NEIGHBOURS)
+    least = distances[nearest].min(axis=1).reshape(centers.shape[:2])
+    i, j = np.minimum((pixels / block).astype(np.int64), np.array(least.shape) - 1).T
+    return least[i, j]
+
+
+def corners_in_world(
+    occupancy: Occupancy, frame: FieldFrame, projection: Projection, *, unbounded: bool
+) -> Float[np.ndarray, "x y z 3"]:
+    """Corners of the cells in the world; nan where they lie at infinity."""
+    shape = tuple(n + 1 for n in occupancy.cells.shape)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    points = occupancy.lower + index * occupancy.cell_size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if projection.active:
+            points = unproject_points(projection, points)
+        elif unbounded:
+            reach = np.abs(points).max(axis=1, keepdims=True) / NORMALIZED_RADIUS
+            points = np.where(reach > 1, points / (reach * (2.0 - reach)), points)
+        points[~np.isfinite(points).all(axis=1) | (np.abs(points).max(axis=1) > FARTHEST)] = np.nan
+    return frame.normalized_from_world.inverse().apply(points).reshape(*shape, 3)
+
+
+def _of_corners(values: Shaped[np.ndarray, "x1 y1 z1"], combine: np.ufunc) -> Shaped[np.ndarray, "x y z"]:
+    """Values at the eight corners of each cell, combined."""
+    for axis in range(3):
+        low, high = (np.take(values, range(first, values.shape[axis] - 1 + first), axis) for first in (0, 1))
+        values = combine(low, high)
+    return values

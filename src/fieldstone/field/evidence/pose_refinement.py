@@ -1,0 +1,215 @@
+"""Poses of photos, moved so that a field shows what the photos show, and held by the points that are known.
+
+A small motion of a camera moves its picture by a flow that follows from the depth. The picture that the field gives,
+shifted so, is compared with the photo: one Gauss-Newton step for six numbers of each photo. The known points of a
+reconstruction say how well they determine the pose, in pixels; moving away from it costs what it costs them.
+
+Source:
+    `lucas1981` with the motion of a rigid scene; the term that holds the poses is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, surface_depth
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, reduce_images
+from fieldstone.geometry.camera import Camera, image_from_cam_jacobian
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rotation import skew
+from fieldstone.scene.rays import Rays, rays_from_view
+
+SIZE_PX = 112
+"""Longer side of the pictures that are compared."""
+
+SIGMA_PX = 0.5
+"""Standard deviation of a known point in a photo, in pixels of the photo."""
+
+MIN_POINTS, UNKNOWN_SIGMA_PX = 20, 3.0
+"""Photos that see fewer are held as if they saw the corners of a cube in the middle of the scene, this exactly."""
+
+SAME_ERROR = 30.0
+"""Neighbouring pixels are wrong together: so many count as one."""
+
+MIN_OPACITY = 0.5
+
+MAX_DEPTH_RATIO = 1.1
+"""Neighbouring pixels whose depths differ more do not lie on one surface."""
+
+LEAST_SIGMA = 0.004
+"""Colours in 8 bits are not known better than to one level."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovablePhoto:
+    """A small photo at the pose that it was given."""
+
+    image: PosedImage
+    information: Float[np.ndarray, "6 6"]
+    """What the known points say of the pose: the inverse covariance of a tangent (omega, v), see `Rigid3.retract`."""
+
+
+def movable_photos(
+    images: tuple[PosedImage, ...], frame: FieldFrame, seen: Mapping[str, SeenPoints] | None
+) -> tuple[MovablePhoto, ...]:
+    """The photos as they are compared, and what holds them.
+
+    Args:
+        seen: Known points of each photo by name, in the world.
+    """
+    corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+    middle = frame.normalized_from_world.inverse().apply(corners)
+    out = []
+    for image, small in zip(images, reduce_images(images, SIZE_PX), strict=True):
+        known = (seen or {}).get(image.name)
+        points, sigma_px = middle, UNKNOWN_SIGMA_PX
+        if known is not None and len(known.xyz) >= MIN_POINTS:
+            points, sigma_px = known.xyz, SIGMA_PX
+        J = pixels_by_pose(image.camera, image.cam_from_world, points)
+        J = J[np.isfinite(J).all(axis=(1, 2))]
+        out.append(MovablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
+    return tuple(out)
+
+
+def pixels_by_pose(
+    camera: Camera, cam_from_world: Rigid3, points_in_world: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2 6"]:
+    """Derivatives of the pixels of points by the tangent (omega, v) of `Rigid3.retract`; nan behind the camera."""
+    _, J_point, _ = image_from_cam_jacobian(camera, cam_from_world.apply(points_in_world))
+    J_world = J_point @ cam_from_world.R
+    return np.concatenate([-J_world @ skew(points_in_world), J_world], axis=2)
+
+
+def refined(
+    photos: Sequence[MovablePhoto],
+    moved: Float[np.ndarray, "v 6"],
+    render_rays: RayRenderer,
+    gains: Float[np.ndarray, "v 3"],
+    background: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "v 6"]:
+    """One step for every photo; a step that does not bring the pictures together is not taken.
+
+    Args:
+        moved: Tangents from the given poses to those of now.
+        render_rays: Of the field, for rays in the world.
+        gains: What each photo multiplies colours by.
+        background: Behind photos with alpha.
+
+    Returns:
+        The tangents after the step.
+    """
+    out = moved.copy()
+    for v, photo in enumerate(photos):
+        target = photo.image.composited(background).reshape(-1, 3)
+        here = _compare(photo, moved[v], render_rays, gains[v], target)
+        step = _step(photo, moved[v], here)
+        if step is None:
+            continue
+        there = _compare(photo, moved[v] + step, render_rays, gains[v], target)
+        both = here.usable & there.usable
+        sigma = here.sigma
+        if _cost(there, both, sigma, photo, moved[v] + step) < _cost(here, both, sigma, photo, moved[v]):
+            out[v] += step
+    return out
+
+
+def at_surfaces(render_rays: RayRenderer, far: float) -> RayRenderer:
+    """The same rays with the distances of what they meet: light that passes does not count as ending at `far`."""
+
+    def render(rays: Rays, /) -> RenderedRays:
+        found = render_rays(rays)
+        depth = surface_depth(found.depth, found.opacity, far)
+        return RenderedRays(found.rgb, np.where(np.isfinite(depth), depth, far).astype(np.float32), found.opacity)
+
+    return render
+
+
+def moved_images(images: Sequence[PosedImage], moved: Float[np.ndarray, "v 6"]) -> tuple[PosedImage, ...]:
+    """The photos at their refined poses."""
+    pairs = zip(images, moved, strict=True)
+    return tuple(replace(image, cam_from_world=image.cam_from_world.retract(tangent)) for image, tangent in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A photo beside what the field shows, pixel by pixel."""
+
+    pose: Rigid3
+    rendered: RenderedRays
+    shown: Float[np.ndarray, "p 3"]
+    residual: Float[np.ndarray, "p 3"]
+    usable: Bool[np.ndarray, "p"]
+    points: Float[np.ndarray, "p 3"]
+
+    @property
+    def sigma(self) -> float:
+        """Of the residuals; not their median: the few pixels on edges and texture are what tells of the pose."""
+        some = self.residual[self.usable]
+        return max(float(np.sqrt(np.mean(some**2))) if some.size else 1.0, LEAST_SIGMA)
+
+
+def _compare(
+    photo: MovablePhoto, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
+) -> _Comparison:
+    image = photo.image
+    pose = image.cam_from_world.retract(tangent)
+    rays = rays_from_view(image.camera, pose)
+    reached = np.flatnonzero(np.isfinite(rays.directions).all(axis=1))
+    rendered = _rendered(render_rays, rays, reached)
+    shown = rendered.rgb.astype(np.float64) * gain
+    usable = _inside_surfaces(image.camera, rendered)
+    if image.keep is not None:
+        usable &= image.keep.reshape(-1)
+    points = rays.origins + rays.directions * rendered.depth[:, None]
+    return _Comparison(pose, rendered, shown, target - shown, usable, points)
+
+
+def _rendered(render_rays: RayRenderer, rays: Rays, rows: Int[np.ndarray, "k"]) -> RenderedRays:
+    """These rays; others, outside of a wide lens, show nothing."""
+    found = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
+    rgb, (depth, opacity) = np.zeros((len(rays), 3), np.float32), np.zeros((2, len(rays)), np.float32)
+    rgb[rows], depth[rows], opacity[rows] = found.rgb, found.depth, found.opacity
+    return RenderedRays(rgb, depth, opacity)
+
+
+def _inside_surfaces(camera: Camera, rendered: RenderedRays) -> Bool[np.ndarray, "p"]:
+    """Pixels that lie on one surface with their neighbours: across an edge the picture does not flow, it is hidden."""
+    shape = camera.height, camera.width
+    opaque = rendered.opacity.reshape(shape) > MIN_OPACITY
+    depth = np.where(opaque, rendered.depth.reshape(shape).astype(np.float64), np.inf)
+    nearest, farthest = minimum_filter(depth, 3, mode="nearest"), maximum_filter(depth, 3, mode="nearest")
+    return (farthest < MAX_DEPTH_RATIO * nearest).reshape(-1)
+
+
+def _step(photo: MovablePhoto, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
+    """The minimum of the linearised squares; None where nothing can be compared."""
+    camera = photo.image.camera
+    grid = here.shown.reshape(camera.height, camera.width, 3)
+    if min(grid.shape[:2]) < 3 or not here.usable.any():
+        return None
+    by_x, by_y = (np.asarray(np.gradient(grid, axis=axis)).reshape(-1, 3) for axis in (1, 0))
+    slopes = np.stack([by_x, by_y], axis=2)[here.usable]
+    flow = pixels_by_pose(camera, here.pose, here.points[here.usable])
+    # photo(x) - shown(x - flow step) = residual + slope . flow step
+    G = np.einsum("pck,pki->pci", slopes, flow).reshape(-1, 6)
+    r = here.residual[here.usable].reshape(-1)
+    good = np.isfinite(G).all(axis=1)
+    G, r = G[good], r[good]
+    weight = 1.0 / (1.0 + (r / here.sigma) ** 2) / (SAME_ERROR * here.sigma**2)
+    A = (G * weight[:, None]).T @ G + photo.information
+    b = G.T @ (weight * r) + photo.information @ tangent
+    try:
+        return -np.linalg.solve(A, b)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _cost(at: _Comparison, usable: np.ndarray, sigma: float, photo: MovablePhoto, tangent: np.ndarray) -> float:
+    """Robust mean of the squared differences, as many as there are, and what the known points pay."""
+    r = at.residual[usable] / sigma
+    return float(0.5 * np.log1p(r**2).sum() / SAME_ERROR + 0.5 * tangent @ photo.information @ tangent)

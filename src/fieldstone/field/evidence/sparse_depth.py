@@ -1,0 +1,151 @@
+"""Triangulated points as what photos are known to see: where, and how certain it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.field.base.projection import Projection, project_points, project_rays
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints, poses_in_frame
+from fieldstone.field.grid.rays import RayTable, coprime_stride
+from fieldstone.field.grid.terms_numba import PointRays
+from fieldstone.geometry.camera import image_from_cam
+from fieldstone.scene.reconstruction import Reconstruction
+
+MIN_SIGMA_PX = 0.5
+"""Observations are not trusted to be better than this."""
+
+MAX_SIGMA = 0.1
+"""Points whose distance is uncertain by more than this share are left out."""
+
+
+def seen_points(model: Reconstruction) -> dict[str, SeenPoints]:
+    """The points that each photo of a model observes, with the standard deviations of their distances.
+
+    Every observation of a point along direction d (unit) at distance D, with a focal length of f pixels, says
+    (f / (sigma D))^2 (I - d d^T) of it; sigma is the reprojection error of the point (RMS), at least `MIN_SIGMA_PX`.
+    The sum over its observations is inverted: narrow angles between rays leave the distance open.
+    """
+    observed, registered = model.observations, model.registered()
+    centers = np.zeros((len(model.views), 3))
+    centers[registered] = model.camera_centers()
+    focal = np.ones(len(model.views))
+    focal[registered] = [float(np.mean(model.camera_of(v).focal)) for v in registered.tolist()]
+    errors = model.reprojection_errors()
+    usable = np.isfinite(errors)
+    view, point = observed.view[usable], observed.point[usable]
+    offset = model.points.xyz[point] - centers[view]
+    distance = np.linalg.norm(offset, axis=1)
+    d = offset / distance[:, None]
+    num_points = len(model.points)
+    count = np.bincount(point, minlength=num_points)
+    mean_square = np.bincount(point, errors[usable] ** 2, minlength=num_points) / np.maximum(count, 1)
+    sigma_px = np.maximum(np.sqrt(mean_square), MIN_SIGMA_PX)
+    weight = (focal[view] / (sigma_px[point] * distance)) ** 2
+    information = np.zeros((num_points, 3, 3))
+    np.add.at(information, point, weight[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None, :]))
+    # Where two rays coincide the inverse does not exist; a little of the trace makes the distance uncertain instead.
+    trace = np.trace(information, axis1=1, axis2=2)
+    information += np.where(trace > 0, 1e-9 * trace, 1.0)[:, None, None] * np.eye(3)
+    covariance = np.linalg.inv(information)
+    sigma = np.sqrt(np.einsum("oi,oij,oj->o", d, covariance[point], d))
+    good = (count[point] >= 2) & (sigma < MAX_SIGMA * distance)
+    return {
+        model.views[v].name: SeenPoints(model.points.xyz[point[good & (view == v)]], sigma[good & (view == v)])
+        for v in registered.tolist()
+    }
+
+
+def no_known_rays() -> tuple[RayTable, PointRays]:
+    """Nothing known."""
+    empty = np.zeros((0, 3), dtype=np.float32)
+    table = RayTable(
+        np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8), empty,
+        np.zeros((0, 3, 3), np.float32), empty, empty[:, 0].copy(), 1,
+    )  # fmt: skip
+    return table, PointRays(empty[:, 0].copy(), empty[:, 0].copy(), empty[:, 0].copy())
+
+
+def known_rays(
+    images: Sequence[PosedImage],
+    frame: FieldFrame,
+    seen: Mapping[str, SeenPoints],
+    projection: Projection,
+    *,
+    unbounded: bool,
+) -> tuple[RayTable, PointRays]:
+    """Rays from photos to the points that they see, the colours there, and how far along each ray its point lies.
+
+    Args:
+        seen: By name of the photo, in the world.
+        unbounded: What is beyond the box is contracted, and steps grow with the square of the distance.
+    """
+    rotations, centers = poses_in_frame(images, frame)
+    world = frame.normalized_from_world
+    parts = []
+    for v, image in enumerate(images):
+        points = seen.get(image.name)
+        if points is None or not len(points.xyz):
+            continue
+        in_cam = image.cam_from_world.apply(points.xyz)
+        pixels = image_from_cam(image.camera, in_cam)
+        inside = np.all((pixels >= 0.5) & (pixels <= [image.camera.width - 0.5, image.camera.height - 0.5]), axis=1)
+        rows = np.flatnonzero(inside)
+        if image.keep is not None:
+            column, row = pixels[rows].astype(np.int64).T
+            rows = rows[image.keep[row, column]]
+        rgba = _colors(image.pixels, pixels[rows])
+        rows, rgba = rows[rgba[:, 3] > 127], rgba[rgba[:, 3] > 127]
+        xyz, sigma = world.apply(points.xyz[rows]), world.scale * points.sigma[rows]
+        along = np.stack(_along(projection, centers[v], xyz, sigma, unbounded))
+        good = np.isfinite(along[0])
+        bearings = in_cam[rows] / np.linalg.norm(in_cam[rows], axis=1, keepdims=True)
+        parts.append((np.full(len(rows), v)[good], bearings[good], rgba[good], along[:, good]))
+    if not sum(len(part[0]) for part in parts):
+        return no_known_rays()
+    image, bearings, rgba = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    along = np.concatenate([part[3] for part in parts], axis=1).astype(np.float32)
+    rows = np.arange(len(image), dtype=np.int32)
+    table = RayTable(
+        image.astype(np.int32), rows, rgba, bearings.astype(np.float32), rotations, centers,
+        np.zeros(len(image), dtype=np.float32), coprime_stride(len(image)),
+    )  # fmt: skip
+    return table, PointRays(*along)
+
+
+def _along(
+    projection: Projection,
+    center: Float[np.ndarray, "3"],
+    points: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n"],
+    unbounded: bool,
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Distance, its standard deviation and the stretch of steps, as rays are marched; nan outside of the space."""
+    offset = points - center
+    distance = np.linalg.norm(offset, axis=1)
+    if not projection.active:
+        reach = np.abs(points).max(axis=1) / NORMALIZED_RADIUS
+        return distance, sigma, np.maximum(reach, 1.0) ** 2 if unbounded else np.ones(len(points))
+    directions = offset / distance[:, None]
+    depth = (points - projection.center) @ projection.R[2]
+    start, _, length = project_rays(projection, np.broadcast_to(center, points.shape), directions)
+    there = np.linalg.norm(project_points(projection, points) - start, axis=1)
+    beyond = np.linalg.norm(project_points(projection, points + sigma[:, None] * directions) - start, axis=1)
+    there = np.where((depth > projection.near) & (there < length), there, np.nan)
+    return there, np.abs(beyond - there), np.ones(len(points))
+
+
+def _colors(pixels: np.ndarray, at_px: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """RGBA between pixel centres, bilinear."""
+    height, width, channels = pixels.shape
+    x, y = at_px[:, 0] - 0.5, at_px[:, 1] - 0.5
+    i, j = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
+    u, w = (x - i)[:, None], (y - j)[:, None]
+    upper = (1 - u) * pixels[j, i] + u * pixels[j, i + 1]
+    lower = (1 - u) * pixels[j + 1, i] + u * pixels[j + 1, i + 1]
+    rgba = np.full((len(x), 4), 255, dtype=np.uint8)
+    rgba[:, :channels] = np.rint((1 - w) * upper + w * lower)
+    return rgba

@@ -1,0 +1,1 @@
+"""The field of dense feature grids: layout, decoder, marching, one step; kernels beside their references."""

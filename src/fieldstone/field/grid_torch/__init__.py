@@ -1,0 +1,1 @@
+"""Training of the grid field by autograd, on any device of torch."""

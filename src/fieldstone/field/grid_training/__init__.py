@@ -1,0 +1,1 @@
+"""Training of the grid field on the CPU, within a time budget."""

@@ -1,0 +1,1 @@
+"""The classical networks: the original NeRF, and the small one of the course."""
