@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 
 from fieldstone.geometry.camera import Camera, plane_from_image, rescale
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.photos import write_photo
+from fieldstone.io.images.photos import write_photo
 from fieldstone.scene.rays import pixel_centers
 from fieldstone.synthetic.building import build_house
 from fieldstone.synthetic.light import look_at

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bundle_problems import RingOptions, ring_problem
-from fieldstone.io.bal import read_bal
+from fieldstone.io.models.bal import read_bal
 from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle.problem import BundleProblem
 from fieldstone.solve.bundle.scipy_reference import bundle_adjust_scipy

@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.colmap import read_colmap
+from fieldstone.io.models.colmap import read_colmap
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
 

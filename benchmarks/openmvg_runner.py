@@ -11,7 +11,7 @@ from pathlib import Path
 import openmvg_rs
 from PIL import Image
 
-from fieldstone.io.photos import list_photos
+from fieldstone.io.images.photos import list_photos
 
 
 def main() -> None:

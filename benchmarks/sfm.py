@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.ground_truth import read_ground_truth
 from fieldstone.evaluate.reconstruction_metrics import area_under_curve, pairwise_pose_errors_deg
-from fieldstone.io.colmap import read_colmap
+from fieldstone.io.models.colmap import read_colmap
 from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 

@@ -8,7 +8,7 @@ import pytest
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.field_verbs import seconds
-from fieldstone.io.photos import write_photo
+from fieldstone.io.images.photos import write_photo
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import replacing, write_bytes, write_json, write_together
+from fieldstone.io.files.atomic import replacing, write_bytes, write_json, write_together
 
 
 def test_replacing_writes_the_whole_file_with_ordinary_permissions(tmp_path):

@@ -7,7 +7,7 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
-from fieldstone.io.bal import read_bal, write_bal
+from fieldstone.io.models.bal import read_bal, write_bal
 from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals
 from matchers import assert_rigid3_near
 from mutations import check_mutations

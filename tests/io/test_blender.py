@@ -11,8 +11,8 @@ import pytest
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.blender import is_blender_folder, read_blender, read_split
-from fieldstone.io.photos import write_photo
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.posed.blender import is_blender_folder, read_blender, read_split
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 from matchers import assert_rigid3_near
 from mutations import check_mutations

@@ -6,7 +6,7 @@ import pytest
 from fieldstone.errors import InputError
 from fieldstone.geometry import rotation
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.camera_path_json import read_camera_path
+from fieldstone.io.posed.camera_path_json import read_camera_path
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 

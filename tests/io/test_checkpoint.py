@@ -3,7 +3,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from fieldstone.errors import InputError
-from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 
 TENSORS = {
     "weights": np.random.default_rng(0).standard_normal((7, 3)).astype(np.float32),

@@ -11,7 +11,7 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.colmap import read_colmap, read_colmap_model, write_colmap
+from fieldstone.io.models.colmap import read_colmap, read_colmap_model, write_colmap
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from matchers import assert_rigid3_near

@@ -7,8 +7,8 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import image_from_cam
-from fieldstone.io.llff import is_llff_folder, read_llff
-from fieldstone.io.photos import write_photo
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.posed.llff import is_llff_folder, read_llff
 from fieldstone.render.camera_paths import look_at
 from real_data import data_folder
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.io.lock import sole_writer
+from fieldstone.io.files.lock import sole_writer
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from fieldstone.io.lock import sole_writer
-from fieldstone.io.atomic import replacing
+from fieldstone.io.files.lock import sole_writer
+from fieldstone.io.files.atomic import replacing
 with sole_writer(Path(sys.argv[1])) as work, replacing(work / "half.bin"):
     print("held", flush=True)
     time.sleep(60)

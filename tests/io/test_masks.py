@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.exif import ORIENTATION
-from fieldstone.io.masks import check_polarity, find_masks, read_mask
-from fieldstone.io.photos import read_photo, read_photo_info, write_photo
+from fieldstone.io.images.exif import ORIENTATION
+from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
+from fieldstone.io.images.photos import read_photo, read_photo_info, write_photo
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.matching_txt import is_course_folder, read_calibration, read_course_folder, read_matching_txt
-from fieldstone.io.photos import write_photo
+from fieldstone.io.course.matching_txt import is_course_folder, read_calibration, read_course_folder, read_matching_txt
+from fieldstone.io.images.photos import write_photo
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from mutations import check_mutations
 from real_data import data_folder

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.io.meshes import linear_rgba, write_mesh
-from fieldstone.io.ply import read_points
+from fieldstone.io.shapes.meshes import linear_rgba, write_mesh
+from fieldstone.io.shapes.ply import read_points
 from fieldstone.scene.mesh import Mesh
 
 TETRAHEDRON = Mesh(

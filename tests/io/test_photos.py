@@ -12,8 +12,8 @@ from PIL.ExifTags import IFD
 from PIL.TiffImagePlugin import IFDRational
 
 from fieldstone.errors import InputError
-from fieldstone.io import photos as photos_module
-from fieldstone.io.photos import (
+from fieldstone.io.images import photos as photos_module
+from fieldstone.io.images.photos import (
     list_photos,
     natural_key,
     read_photo,

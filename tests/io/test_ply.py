@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
-from fieldstone.io.ply import read_points, write_points
+from fieldstone.io.shapes.ply import read_points, write_points
 from fieldstone.scene.reconstruction import Points
 from mutations import check_mutations
 from real_data import data_folder

@@ -5,7 +5,7 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.rotation import from_wxyz, random_rotation
-from fieldstone.io.splats import PROPERTIES, write_splats
+from fieldstone.io.shapes.splats import PROPERTIES, write_splats
 from fieldstone.scene.splats import NUM_SH, Splats
 
 

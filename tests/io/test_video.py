@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.video import write_gif, write_mp4
+from fieldstone.io.images.video import write_gif, write_mp4
 
 
 def ramp_frames(n, height, width):

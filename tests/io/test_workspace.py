@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fieldstone.features.sift import SiftOptions
-from fieldstone.io import workspace as module
-from fieldstone.io.workspace import Packing, Unit, Workspace, file_hash, key_of, resumed
+from fieldstone.io.files import cache as module
+from fieldstone.io.files.cache import Packing, Unit, Workspace, file_hash, key_of, resumed
 
 PACKING = Packing(lambda value: Unit({"value": value}, {"size": len(value)}), lambda unit: unit.arrays["value"])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.workspace import Workspace
+from fieldstone.io.files.cache import Workspace
 from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, map_incremental
 from fieldstone.mapping.model.calibration import CalibrationStep, as_model
 from fieldstone.pipeline.kept_growth import KeptGrowth

@@ -8,7 +8,7 @@ import pytest
 from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
-from fieldstone.io.photos import write_photo
+from fieldstone.io.images.photos import write_photo
 from fieldstone.pipeline import fast_fields
 from fieldstone.pipeline.fast_fields import train_fast_run
 

@@ -16,9 +16,9 @@ from PIL.ExifTags import IFD
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.features.sift import SiftOptions
-from fieldstone.io.colmap import read_colmap
-from fieldstone.io.exif import FOCAL_LENGTH_35MM
-from fieldstone.io.workspace import Workspace
+from fieldstone.io.files.cache import Workspace
+from fieldstone.io.images.exif import FOCAL_LENGTH_35MM
+from fieldstone.io.models.colmap import read_colmap
 from fieldstone.pipeline.detection import sharpness
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.material import match_photos

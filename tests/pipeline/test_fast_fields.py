@@ -10,9 +10,9 @@ from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.checkpoint import read_checkpoint
-from fieldstone.io.photos import write_photo
-from fieldstone.io.posed_photos import PosedPhoto
+from fieldstone.io.files.checkpoint import read_checkpoint
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.posed.posed_photos import PosedPhoto
 from fieldstone.pipeline import fast_fields, fast_stages
 from fieldstone.pipeline.fast_fields import size_in_memory, train_fast_run
 from fieldstone.pipeline.fields import split_tensors

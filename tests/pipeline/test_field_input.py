@@ -8,8 +8,8 @@ import pytest
 from fast_scenes import ball_images
 from fieldstone.errors import InputError
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
-from fieldstone.io.photos import write_photo
-from fieldstone.io.ply import write_points
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.shapes.ply import write_points
 from fieldstone.pipeline.field_input import open_field_input, read_ray_dataset
 from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.reconstruction import Points

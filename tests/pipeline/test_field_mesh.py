@@ -8,8 +8,8 @@ import pytest
 from fast_scenes import RADIUS, ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
-from fieldstone.io.photos import write_photo
-from fieldstone.io.ply import read_points
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.shapes.ply import read_points
 from fieldstone.pipeline.fast_fields import train_fast_run
 from fieldstone.pipeline.field_mesh import mesh_run
 from fieldstone.pipeline.field_splats import splat_run

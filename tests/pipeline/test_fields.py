@@ -11,9 +11,9 @@ from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr, ssim
 from fieldstone.field.base.training import PRESETS, TINY
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
-from fieldstone.io.colmap import write_colmap
-from fieldstone.io.photos import read_photo, write_photo
+from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.images.photos import read_photo, write_photo
+from fieldstone.io.models.colmap import write_colmap
 from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
 from fieldstone.pipeline.field_render import render_run
 from fieldstone.pipeline.fields import train_run

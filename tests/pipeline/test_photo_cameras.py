@@ -6,8 +6,8 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, image_from_plane
-from fieldstone.io.exif import ExifFacts
-from fieldstone.io.photos import PhotoInfo, turned_upright
+from fieldstone.io.images.exif import ExifFacts
+from fieldstone.io.images.photos import PhotoInfo, turned_upright
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.pipeline.photo_cameras import cameras_of_photos
 

@@ -11,7 +11,7 @@ import pytest
 from fieldstone.cli import main
 from fieldstone.evaluate.reconstruction_metrics import pairwise_pose_errors_deg
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.colmap import read_colmap
+from fieldstone.io.models.colmap import read_colmap
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction, View
 from fieldstone.synthetic.scenes import SceneOptions, synthesize

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from fieldstone.features.verification import verify_pairs
-from fieldstone.io.exif import ExifFacts
-from fieldstone.io.photos import PhotoInfo
+from fieldstone.io.images.exif import ExifFacts
+from fieldstone.io.images.photos import PhotoInfo
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.incremental.recovery import Wanted
 from fieldstone.pipeline.detection import SeenPhoto

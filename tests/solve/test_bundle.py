@@ -7,7 +7,7 @@ import pytest
 from bundle_worlds import mixed_problem, perturbed, without_refinement
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.bal import read_bal
+from fieldstone.io.models.bal import read_bal
 from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle.camera_prior import CameraPrior
 from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fieldstone.field.base.training import OnStep
-from fieldstone.io.atomic import write_json
-from fieldstone.io.colmap import find_colmap_model, read_colmap
+from fieldstone.io.files.atomic import write_json
+from fieldstone.io.models.colmap import find_colmap_model, read_colmap
 from fieldstone.pipeline.fast_fields import train_fast_run
 from fieldstone.pipeline.material import OnStage
 from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct

@@ -14,10 +14,10 @@ from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.features.sift import Sift, reduced_grey
-from fieldstone.io.masks import check_polarity, find_masks, read_mask
-from fieldstone.io.names import name_problem
-from fieldstone.io.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
-from fieldstone.io.workspace import Unit, Workspace, code_version, file_hash, key_of
+from fieldstone.io.files.cache import Unit, Workspace, code_version, file_hash, key_of
+from fieldstone.io.files.names import name_problem
+from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
+from fieldstone.io.images.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.features import Features
 

@@ -36,10 +36,10 @@ from fieldstone.field.grid_training.training import FastTraining, fast_training
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
-from fieldstone.io.atomic import write_json, write_text
-from fieldstone.io.checkpoint import write_checkpoint
-from fieldstone.io.photos import write_photo
-from fieldstone.io.posed_photos import PosedPhoto
+from fieldstone.io.files.atomic import write_json, write_text
+from fieldstone.io.files.checkpoint import write_checkpoint
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.posed.posed_photos import PosedPhoto
 from fieldstone.pipeline.fast_stages import PlannedState, measured_step, train_stages
 from fieldstone.pipeline.field_input import (
     check_sizes,

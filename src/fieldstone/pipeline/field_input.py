@@ -29,13 +29,13 @@ from fieldstone.field.evidence.borders import kept_inside_borders
 from fieldstone.field.evidence.sparse_depth import seen_points
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.blender import BlenderScene, is_blender_folder, read_blender
-from fieldstone.io.colmap import find_colmap_model, read_colmap
-from fieldstone.io.llff import is_llff_folder, read_llff
-from fieldstone.io.masks import find_masks, read_mask
-from fieldstone.io.photos import read_photo, read_photo_info
-from fieldstone.io.posed_photos import PosedPhoto, PosedScene
-from fieldstone.io.transforms_json import find_transforms, read_transforms
+from fieldstone.io.images.masks import find_masks, read_mask
+from fieldstone.io.images.photos import read_photo, read_photo_info
+from fieldstone.io.models.colmap import find_colmap_model, read_colmap
+from fieldstone.io.posed.blender import BlenderScene, is_blender_folder, read_blender
+from fieldstone.io.posed.llff import is_llff_folder, read_llff
+from fieldstone.io.posed.posed_photos import PosedPhoto, PosedScene
+from fieldstone.io.posed.transforms_json import find_transforms, read_transforms
 from fieldstone.render.camera_paths import focus_point
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -140,7 +140,7 @@ def _masked_borders(images: Sequence[PosedImage]) -> list[PosedImage]:
 
 
 def with_masks(given: FieldInput, masks: Path | None, source: Path) -> FieldInput:
-    """The input with the masks of a folder, see `io.masks.find_masks`.
+    """The input with the masks of a folder, see `io.images.masks.find_masks`.
 
     Args:
         masks: None: those that the reconstruction in `source` was made with, or those that the input names.

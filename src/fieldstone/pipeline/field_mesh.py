@@ -21,9 +21,9 @@ from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_wor
 from fieldstone.field.grid.field import FastField, field_from_tensors, renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.atomic import write_json
-from fieldstone.io.checkpoint import read_checkpoint
-from fieldstone.io.meshes import write_mesh
+from fieldstone.io.files.atomic import write_json
+from fieldstone.io.files.checkpoint import read_checkpoint
+from fieldstone.io.shapes.meshes import write_mesh
 from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
 from fieldstone.render.camera_paths import up_direction
 from fieldstone.render.depth_fusion import fused

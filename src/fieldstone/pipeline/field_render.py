@@ -19,10 +19,10 @@ from fieldstone.field.base.training import TrainOptions
 from fieldstone.field.grid.field import field_from_tensors, renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.camera_path_json import read_camera_path
-from fieldstone.io.checkpoint import read_checkpoint
-from fieldstone.io.photos import write_photo
-from fieldstone.io.video import write_gif, write_mp4
+from fieldstone.io.files.checkpoint import read_checkpoint
+from fieldstone.io.images.photos import write_photo
+from fieldstone.io.images.video import write_gif, write_mp4
+from fieldstone.io.posed.camera_path_json import read_camera_path
 from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
 from fieldstone.render.camera_paths import orbit, spiral, through
 from fieldstone.render.views import RenderedView, confidence_image, depth_image, normal_image, render_view

@@ -27,9 +27,9 @@ from fieldstone.field.base.training import PRESETS, CurvePoint, OnStep, TrainOpt
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
-from fieldstone.io.atomic import write_json
-from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
-from fieldstone.io.photos import read_photo, write_photo
+from fieldstone.io.files.atomic import write_json
+from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
 from fieldstone.render.views import render_view
 from fieldstone.report.figure_store import write_figures

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldstone.io.workspace import Unit, Workspace, code_version, key_of
+from fieldstone.io.files.cache import Unit, Workspace, code_version, key_of
 
 STAGE = "growth"
 

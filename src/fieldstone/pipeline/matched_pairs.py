@@ -12,7 +12,7 @@ from fieldstone.features.matching import MutualRatio
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.workspace import Packing, Unit, Workspace, code_version, key_of, resumed
+from fieldstone.io.files.cache import Packing, Unit, Workspace, code_version, key_of, resumed
 from fieldstone.pipeline.detection import SeenPhoto
 from fieldstone.pipeline.matching_options import MatchingOptions
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView

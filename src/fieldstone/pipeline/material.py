@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from fieldstone.errors import InputError
 from fieldstone.features.pairs import choose_pairs
 from fieldstone.geometry.camera import Camera, rescale
-from fieldstone.io.matching_txt import read_course_folder
-from fieldstone.io.photos import PhotoProblem, list_photos, read_photo
-from fieldstone.io.workspace import Workspace
+from fieldstone.io.course.matching_txt import read_course_folder
+from fieldstone.io.files.cache import Workspace
+from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.mapping.incremental.recovery import MoreMatches
 from fieldstone.pipeline.detection import detect
 from fieldstone.pipeline.matched_pairs import match_pairs, verify

@@ -16,13 +16,13 @@ import numpy as np
 
 from fieldstone import __version__
 from fieldstone.features.verification import verify_pairs
-from fieldstone.io.atomic import write_json
-from fieldstone.io.checkpoint import write_checkpoint
-from fieldstone.io.colmap import write_colmap
-from fieldstone.io.lock import sole_writer
-from fieldstone.io.matching_txt import is_course_folder
-from fieldstone.io.ply import write_points
-from fieldstone.io.workspace import Workspace
+from fieldstone.io.course.matching_txt import is_course_folder
+from fieldstone.io.files.atomic import write_json
+from fieldstone.io.files.cache import Workspace
+from fieldstone.io.files.checkpoint import write_checkpoint
+from fieldstone.io.files.lock import sole_writer
+from fieldstone.io.models.colmap import write_colmap
+from fieldstone.io.shapes.ply import write_points
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity
 from fieldstone.mapping.incremental.checkpoint import GrowthMemory

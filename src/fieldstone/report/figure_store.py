@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_bytes, write_json, write_text
+from fieldstone.io.files.atomic import write_bytes, write_json, write_text
 from fieldstone.report.raster import encode_jpeg
 from fieldstone.report.theme import DARK, LIGHT, LIGHTBOX, Theme
 

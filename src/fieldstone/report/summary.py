@@ -20,7 +20,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_text
+from fieldstone.io.files.atomic import write_text
 from fieldstone.report.figure_store import FigureIndex, StoredFigure, read_index, read_json
 
 logger = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_bytes
+from fieldstone.io.files.atomic import write_bytes
 
 HEADER_KEY = "fieldstone"
 FORMAT = 1

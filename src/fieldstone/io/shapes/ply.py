@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_bytes
-from fieldstone.io.binary import bytes_left, read_array, refuse_at
+from fieldstone.io.files.atomic import write_bytes
+from fieldstone.io.files.binary import bytes_left, read_array, refuse_at
 from fieldstone.scene.reconstruction import Points
 
 TYPES = {

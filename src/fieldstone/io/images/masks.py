@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.io.photos import PHOTO_SUFFIXES, PhotoInfo, read_photo, read_photo_info, turned_upright
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoInfo, read_photo, read_photo_info, turned_upright
 
 logger = logging.getLogger(__name__)
 

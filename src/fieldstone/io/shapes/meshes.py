@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_bytes
+from fieldstone.io.files.atomic import write_bytes
 from fieldstone.scene.mesh import Mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.rotation import to_wxyz
-from fieldstone.io.atomic import write_bytes
+from fieldstone.io.files.atomic import write_bytes
 from fieldstone.scene.splats import NUM_SH, Splats
 
 NUM_REST = 45

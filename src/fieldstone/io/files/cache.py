@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from fieldstone.errors import InputError
-from fieldstone.io.checkpoint import read_checkpoint, write_checkpoint
+from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from fieldstone.geometry.camera import CAMERA_MODELS, Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import from_wxyz
-from fieldstone.io.names import name_problem
+from fieldstone.io.files.names import name_problem
 
 MAX_QUATERNION = 1e6
 """Files may hold quaternions that are not normalised, but not by so much."""

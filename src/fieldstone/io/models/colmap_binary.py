@@ -14,15 +14,15 @@ import numpy as np
 
 from fieldstone.geometry.camera import CAMERA_MODELS, Camera
 from fieldstone.geometry.rotation import to_wxyz
-from fieldstone.io.binary import read_array, read_count, read_struct, refuse_at
-from fieldstone.io.colmap_tables import (
+from fieldstone.io.files.binary import read_array, read_count, read_struct, refuse_at
+from fieldstone.io.files.names import MAX_NAME_BYTES
+from fieldstone.io.models.colmap_tables import (
     COLMAP_MODEL_NAMES,
     ColmapImage,
     ColmapTables,
     make_camera,
     make_image,
 )
-from fieldstone.io.names import MAX_NAME_BYTES
 
 COUNT = struct.Struct("<Q")
 CAMERA = struct.Struct("<IiQQ")

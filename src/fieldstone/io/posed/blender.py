@@ -22,8 +22,8 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
-from fieldstone.io.names import name_problem
-from fieldstone.io.photos import PHOTO_SUFFIXES, Photo, PhotoProblem, read_photo, read_photo_info
+from fieldstone.io.files.names import name_problem
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, Photo, PhotoProblem, read_photo, read_photo_info
 
 logger = logging.getLogger(__name__)
 

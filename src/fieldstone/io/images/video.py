@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import replacing
+from fieldstone.io.files.atomic import replacing
 
 Frame = UInt8[np.ndarray, "h w 3"]
 

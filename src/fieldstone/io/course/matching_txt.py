@@ -20,8 +20,8 @@ from jaxtyping import Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, pinhole
-from fieldstone.io.course_photos import CoursePhotos, find_photos
-from fieldstone.io.photos import PhotoProblem
+from fieldstone.io.course.photos import CoursePhotos, find_photos
+from fieldstone.io.images.photos import PhotoProblem
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
 logger = logging.getLogger(__name__)

@@ -19,9 +19,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import replacing
-from fieldstone.io.exif import ExifFacts, exif_facts
-from fieldstone.io.heic import HAS_HEIC, HEIC_SUFFIXES, teach_pillow
+from fieldstone.io.files.atomic import replacing
+from fieldstone.io.images.exif import ExifFacts, exif_facts
+from fieldstone.io.images.heic import HAS_HEIC, HEIC_SUFFIXES, teach_pillow
 
 logger = logging.getLogger(__name__)
 

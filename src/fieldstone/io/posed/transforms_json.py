@@ -19,10 +19,10 @@ from jaxtyping import Float
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.names import name_problem
-from fieldstone.io.photos import PHOTO_SUFFIXES, natural_key, read_photo_info
-from fieldstone.io.ply import read_points
-from fieldstone.io.posed_photos import PosedPhoto, PosedScene, rigid_from_gl
+from fieldstone.io.files.names import name_problem
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, natural_key, read_photo_info
+from fieldstone.io.posed.posed_photos import PosedPhoto, PosedScene, rigid_from_gl
+from fieldstone.io.shapes.ply import read_points
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,8 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
-from fieldstone.io.photos import PHOTO_SUFFIXES, read_photo_info
-from fieldstone.io.posed_photos import MAX_DEVIATION, PosedPhoto, PosedScene
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, read_photo_info
+from fieldstone.io.posed.posed_photos import MAX_DEVIATION, PosedPhoto, PosedScene
 
 FILE = "poses_bounds.npy"
 

@@ -17,7 +17,7 @@ import numpy as np
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rotation import to_wxyz
-from fieldstone.io.colmap_tables import ColmapImage, ColmapTables, make_camera, make_image
+from fieldstone.io.models.colmap_tables import ColmapImage, ColmapTables, make_camera, make_image
 
 MAX_ID = 2**63 - 1
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import TEMPORARY_PREFIX
+from fieldstone.io.files.atomic import TEMPORARY_PREFIX
 
 LOCK = "lock"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldstone.errors import InputError
-from fieldstone.io.photos import PHOTO_SUFFIXES, PhotoProblem, natural_key, read_photo
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoProblem, natural_key, read_photo
 
 logger = logging.getLogger(__name__)
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.io.atomic import write_together
-from fieldstone.io.colmap_binary import decode_binary, encode_binary
-from fieldstone.io.colmap_tables import NO_POINT, ColmapImage, ColmapTables
-from fieldstone.io.colmap_text import decode_text, encode_text
-from fieldstone.io.names import name_problem
+from fieldstone.io.files.atomic import write_together
+from fieldstone.io.files.names import name_problem
+from fieldstone.io.models.colmap_binary import decode_binary, encode_binary
+from fieldstone.io.models.colmap_tables import NO_POINT, ColmapImage, ColmapTables
+from fieldstone.io.models.colmap_text import decode_text, encode_text
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
 

@@ -1,0 +1,1 @@
+"""Photos, their EXIF and masks, films."""

@@ -1,0 +1,1 @@
+"""Posed photos in the formats of others."""
