@@ -29,9 +29,9 @@ from fieldstone.field.grid.step_numba import draw_rays
 from fieldstone.field.grid_training.plan import plan_from_json
 from fieldstone.field.grid_training.training import FastState, FastTraining, fast_training
 from fieldstone.io.files.checkpoint import read_checkpoint
-from fieldstone.pipeline.fast_fields import MAX_SIZE_PX, train_fast_run
-from fieldstone.pipeline.field_input import read_ray_dataset
-from fieldstone.pipeline.fields import split_tensors
+from fieldstone.run.fast_fields import MAX_SIZE_PX, train_fast_run
+from fieldstone.run.field_input import read_ray_dataset
+from fieldstone.run.fields import split_tensors
 
 REPEATS = 30
 

@@ -26,10 +26,10 @@ from fieldstone.field.base.radiance_field import in_world
 from fieldstone.field.base.training import PRESETS, train
 from fieldstone.field.grid.field import field_from_tensors, renderer
 from fieldstone.io.files.checkpoint import read_checkpoint
-from fieldstone.pipeline.field_input import read_ray_dataset
-from fieldstone.pipeline.field_mesh import compared_views
-from fieldstone.pipeline.fields import frame_from_header, open_training, split_tensors
 from fieldstone.render.views import progressive_views, render_view
+from fieldstone.run.field_input import read_ray_dataset
+from fieldstone.run.fields import frame_from_header, open_training, split_tensors
+from fieldstone.run.mesh import compared_views
 
 FRAMES = 12
 BATCHES = 20

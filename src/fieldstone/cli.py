@@ -23,7 +23,7 @@ from fieldstone.field_verbs import Out, Source, mesh, plain_console, render, sec
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fieldstone.pipeline.matching_options import MatchingOptions
+    from fieldstone.run.matching.options import MatchingOptions
 
 GC_THRESHOLD = 100_000
 """New objects between two collections."""
@@ -71,8 +71,8 @@ def reconstruct(
     """
     from fieldstone.mapping.automatic import AutomaticOptions
     from fieldstone.mapping.self_calibration import SelfCalibrationOptions
-    from fieldstone.pipeline.reconstruct import ReconstructOptions
-    from fieldstone.pipeline.reconstruct import reconstruct as run
+    from fieldstone.run.reconstruct import ReconstructOptions
+    from fieldstone.run.reconstruct import reconstruct as run
 
     matching = _matching_options(
         camera_model, intrinsics, fix_intrinsics, single_camera, max_image_size, threads or os.cpu_count() or 1
@@ -98,7 +98,7 @@ def _matching_options(
 ) -> MatchingOptions:
     """How photos are matched, and what is known of their cameras."""
     from fieldstone.features.sift import SiftOptions
-    from fieldstone.pipeline.matching_options import MatchingOptions
+    from fieldstone.run.matching.options import MatchingOptions
 
     numbers = None
     if intrinsics is not None:
@@ -129,9 +129,9 @@ def demo(*, out: Out = Path("fieldstone-demo"), budget: str = "60s", threads: in
         threads: 0 takes all cores. The result of the reconstruction is the same for any number.
         seed: Every random number of the run follows from it.
     """
-    from fieldstone.pipeline.demo import run_demo
-    from fieldstone.pipeline.matching_options import MatchingOptions
-    from fieldstone.pipeline.reconstruct import ReconstructOptions
+    from fieldstone.run.demo import run_demo
+    from fieldstone.run.matching.options import MatchingOptions
+    from fieldstone.run.reconstruct import ReconstructOptions
 
     console = plain_console()
     options = ReconstructOptions(matching=MatchingOptions(threads=threads or os.cpu_count() or 1), seed=seed)

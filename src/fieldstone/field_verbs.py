@@ -74,8 +74,8 @@ def train(
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from fieldstone.pipeline.fast_fields import train_fast_run
-    from fieldstone.pipeline.fields import train_run
+    from fieldstone.run.fast_fields import train_fast_run
+    from fieldstone.run.fields import train_run
 
     if field != "fast" and (plan is not None or not alpha):
         raise InputError(f"--plan and --no-alpha belong to the fast field; leave them out for --field {field}")
@@ -163,7 +163,7 @@ def render(
     """
     from rich.progress import Progress
 
-    from fieldstone.pipeline.field_render import render_run
+    from fieldstone.run.render import render_run
 
     console = plain_console()
     with Progress(console=console) as progress:
@@ -202,7 +202,7 @@ def mesh(
         level: Share of the light that matter must stop to count as solid.
         threads: 0 takes all cores.
     """
-    from fieldstone.pipeline.field_mesh import mesh_run
+    from fieldstone.run.mesh import mesh_run
 
     console = plain_console()
     with console.status("reading") as status:
@@ -226,7 +226,7 @@ def splat(source: Source, /, *, cells: int | None = None, level: float = 0.5, th
         level: Share of the light that matter must stop to count as solid.
         threads: 0 takes all cores.
     """
-    from fieldstone.pipeline.field_splats import splat_run
+    from fieldstone.run.splats import splat_run
 
     console = plain_console()
     with console.status("reading") as status:

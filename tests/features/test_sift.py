@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduced_grey, root_sift, spread
-from fieldstone.pipeline.detection import opencv_threads
+from fieldstone.run.matching.detection import opencv_threads
 
 
 def blob(x: float, y: float, sigma: float, width: int = 180, height: int = 160) -> np.ndarray:

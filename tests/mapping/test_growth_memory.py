@@ -9,7 +9,7 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.io.files.cache import Workspace
 from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, map_incremental
 from fieldstone.mapping.model.calibration import CalibrationStep, as_model
-from fieldstone.pipeline.kept_growth import KeptGrowth
+from fieldstone.run.kept_growth import KeptGrowth
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 
 STARTING_STEP = CalibrationStep("SIMPLE_RADIAL", ("f", "k"))

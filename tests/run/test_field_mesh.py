@@ -10,9 +10,9 @@ from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.shapes.ply import read_points
-from fieldstone.pipeline.fast_fields import train_fast_run
-from fieldstone.pipeline.field_mesh import mesh_run
-from fieldstone.pipeline.field_splats import splat_run
+from fieldstone.run.fast_fields import train_fast_run
+from fieldstone.run.mesh import mesh_run
+from fieldstone.run.splats import splat_run
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from fieldstone.errors import InputError
 from fieldstone.features.verification import MAX_VOTING_PAIRS, calibrate_from_pairs
 from fieldstone.geometry.camera import Camera, rescale, turned
 from fieldstone.io.images.photos import PhotoInfo
-from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.solve.robust.focal_voting import FocalVote
 

@@ -19,10 +19,10 @@ from fieldstone.features.sift import SiftOptions
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.exif import FOCAL_LENGTH_35MM
 from fieldstone.io.models.colmap import read_colmap
-from fieldstone.pipeline.detection import sharpness
-from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.material import match_photos
-from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct
+from fieldstone.run.matching.detection import sharpness
+from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.photos_to_graph import match_photos
+from fieldstone.run.reconstruct import ReconstructOptions, reconstruct
 from fieldstone.synthetic import materials
 from fieldstone.synthetic.construction import Builder
 from fieldstone.synthetic.light import Sky, look_at

@@ -15,8 +15,8 @@ from fieldstone.features.pairs import preview_counts
 from fieldstone.features.sift import Sift
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.mapping.incremental.recovery import MoreMatches, Wanted
-from fieldstone.pipeline.detection import SeenPhoto, opencv_threads
-from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.run.matching.detection import SeenPhoto, opencv_threads
+from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 

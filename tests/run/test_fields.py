@@ -14,10 +14,10 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
-from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
-from fieldstone.pipeline.field_render import render_run
-from fieldstone.pipeline.fields import train_run
 from fieldstone.render.camera_paths import look_at
+from fieldstone.run.field_input import read_ray_dataset, view_labels
+from fieldstone.run.fields import train_run
+from fieldstone.run.render import render_run
 from fieldstone.scene.rays import rays_from_view
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations

@@ -13,8 +13,8 @@ from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.cache import Packing, Unit, Workspace, code_version, key_of, resumed
-from fieldstone.pipeline.detection import SeenPhoto
-from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.run.matching.detection import SeenPhoto
+from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 
 

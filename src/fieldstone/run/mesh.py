@@ -24,12 +24,12 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.shapes.meshes import write_mesh
-from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, split_tensors
 from fieldstone.render.camera_paths import up_direction
 from fieldstone.render.depth_fusion import fused
 from fieldstone.render.meshing import cleaned, colored, solidity, surface
 from fieldstone.render.rasterize_numba import mesh_depth
 from fieldstone.render.views import render_view
+from fieldstone.run.fields import CHECKPOINT, frame_from_header, split_tensors
 from fieldstone.scene.mesh import Mesh
 from fieldstone.scene.rays import rays_from_view
 

@@ -8,8 +8,8 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, image_from_plane
 from fieldstone.io.images.exif import ExifFacts
 from fieldstone.io.images.photos import PhotoInfo, turned_upright
-from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.photo_cameras import cameras_of_photos
+from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.photo_cameras import cameras_of_photos
 
 STORED = Camera("OPENCV", 640, 480, np.array([500.0, 510, 322, 236, 0.1, -0.02, 0.003, -0.002]))
 

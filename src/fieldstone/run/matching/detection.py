@@ -18,7 +18,7 @@ from fieldstone.io.files.cache import Unit, Workspace, code_version, file_hash, 
 from fieldstone.io.files.names import name_problem
 from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
 from fieldstone.io.images.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
-from fieldstone.pipeline.matching_options import MatchingOptions
+from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.features import Features
 
 STAGE = "features"

@@ -13,9 +13,9 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.posed.posed_photos import PosedPhoto
-from fieldstone.pipeline import fast_fields, fast_stages
-from fieldstone.pipeline.fast_fields import size_in_memory, train_fast_run
-from fieldstone.pipeline.fields import split_tensors
+from fieldstone.run import fast_fields, fast_stages
+from fieldstone.run.fast_fields import size_in_memory, train_fast_run
+from fieldstone.run.fields import split_tensors
 
 CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 1500.0]))
 

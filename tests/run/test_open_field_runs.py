@@ -13,7 +13,7 @@ from fieldstone.field.grid_training.plan import first_plan
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
-from fieldstone.pipeline.fast_fields import train_fast_run
+from fieldstone.run.fast_fields import train_fast_run
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
 

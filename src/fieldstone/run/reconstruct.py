@@ -27,12 +27,12 @@ from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity
 from fieldstone.mapping.incremental.checkpoint import GrowthMemory
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
-from fieldstone.pipeline.kept_growth import KeptGrowth
-from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.material import Material, OnStage, match_photos, read_course
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
 from fieldstone.report.summary import write_report
+from fieldstone.run.kept_growth import KeptGrowth
+from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.photos_to_graph import Material, OnStage, match_photos, read_course
 from fieldstone.scene.mapping_run import MappingRun, StageRecord
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction, View

@@ -23,9 +23,9 @@ from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.images.video import write_gif, write_mp4
 from fieldstone.io.posed.camera_path_json import read_camera_path
-from fieldstone.pipeline.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
 from fieldstone.render.camera_paths import orbit, spiral, through
 from fieldstone.render.views import RenderedView, confidence_image, depth_image, normal_image, render_view
+from fieldstone.run.fields import CHECKPOINT, frame_from_header, open_training, split_tensors
 
 FilmFormat = Literal["mp4", "gif", "png"]
 Shown = Literal["color", "depth", "normals", "opacity", "confidence"]

@@ -40,8 +40,9 @@ from fieldstone.io.files.atomic import write_json, write_text
 from fieldstone.io.files.checkpoint import write_checkpoint
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.posed.posed_photos import PosedPhoto
-from fieldstone.pipeline.fast_stages import PlannedState, measured_step, train_stages
-from fieldstone.pipeline.field_input import (
+from fieldstone.render.views import render_view
+from fieldstone.run.fast_stages import PlannedState, measured_step, train_stages
+from fieldstone.run.field_input import (
     check_sizes,
     dataset_of,
     holding_out,
@@ -49,7 +50,7 @@ from fieldstone.pipeline.field_input import (
     read_images,
     with_masks,
 )
-from fieldstone.pipeline.fields import (
+from fieldstone.run.fields import (
     CHECKPOINT,
     CURVE,
     METRICS,
@@ -61,7 +62,6 @@ from fieldstone.pipeline.fields import (
     torch_for,
     write_field_report,
 )
-from fieldstone.render.views import render_view
 
 logger = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from fieldstone.field.grid.interpolation_numba import interpolate_numba
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.shapes.splats import write_splats
-from fieldstone.pipeline.field_mesh import COLOR_CELLS, compared_views, normalized_mesh, solid_field
 from fieldstone.render.splat_view_numba import splat_view
 from fieldstone.render.splatting import splats_of_surface
 from fieldstone.render.views import render_view
+from fieldstone.run.mesh import COLOR_CELLS, compared_views, normalized_mesh, solid_field
 from fieldstone.scene.mesh import Mesh
 from fieldstone.scene.splats import Splats
 

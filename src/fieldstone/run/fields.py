@@ -30,11 +30,11 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
-from fieldstone.pipeline.field_input import read_ray_dataset, view_labels
 from fieldstone.render.views import render_view
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import field_figures
 from fieldstone.report.summary import write_report
+from fieldstone.run.field_input import read_ray_dataset, view_labels
 
 logger = logging.getLogger(__name__)
 

@@ -19,12 +19,12 @@ from fieldstone.io.course.matching_txt import read_course_folder
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.mapping.incremental.recovery import MoreMatches
-from fieldstone.pipeline.detection import detect
-from fieldstone.pipeline.matched_pairs import match_pairs, verify
-from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
-from fieldstone.pipeline.second_look import SecondLook
 from fieldstone.report.raster import DRAWN_PX
+from fieldstone.run.matching.detection import detect
+from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.pairs import match_pairs, verify
+from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
+from fieldstone.run.matching.recovery import SecondLook
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 

@@ -10,9 +10,9 @@ import numpy as np
 from fieldstone.field.base.training import OnStep
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.models.colmap import find_colmap_model, read_colmap
-from fieldstone.pipeline.fast_fields import train_fast_run
-from fieldstone.pipeline.material import OnStage
-from fieldstone.pipeline.reconstruct import ReconstructOptions, reconstruct
+from fieldstone.run.fast_fields import train_fast_run
+from fieldstone.run.matching.photos_to_graph import OnStage
+from fieldstone.run.reconstruct import ReconstructOptions, reconstruct
 from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.synthetic.photos import PhotoOptions, make_photos, write_photos

@@ -9,9 +9,9 @@ from fieldstone.io.images.exif import ExifFacts
 from fieldstone.io.images.photos import PhotoInfo
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.incremental.recovery import Wanted
-from fieldstone.pipeline.detection import SeenPhoto
-from fieldstone.pipeline.matching_options import MatchingOptions
-from fieldstone.pipeline.second_look import SecondLook
+from fieldstone.run.matching.detection import SeenPhoto
+from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.recovery import SecondLook
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.solve.robust.two_view import TwoViewOptions

@@ -9,8 +9,8 @@ from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.io.images.photos import write_photo
-from fieldstone.pipeline import fast_fields
-from fieldstone.pipeline.fast_fields import train_fast_run
+from fieldstone.run import fast_fields
+from fieldstone.run.fast_fields import train_fast_run
 
 STEPS = {"finest": 24, "steps": [6] * 8, "num_chunks": 2, "samples_per_chunk": 256}
 
