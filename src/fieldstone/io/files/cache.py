@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+import fieldstone
 from fieldstone.errors import InputError
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 
@@ -104,7 +105,7 @@ def key_of(*parts: Any) -> str:
 @cache
 def code_version() -> str:
     """Hash of this program's sources: other code may give other results, whatever the version says."""
-    package = Path(__file__).resolve().parents[1]
+    package = Path(fieldstone.__file__).resolve().parent
     sources = sorted(package.rglob("*.py"))
     return key_of(*[[path.relative_to(package).as_posix(), file_hash(path)] for path in sources])
 
