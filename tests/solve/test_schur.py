@@ -33,6 +33,7 @@ PROBLEMS = {
     "many views": perturbed(mixed_problem(num_views=45, num_points=40)),
     "sparse": perturbed(mixed_problem(num_views=100, num_points=150, reach=3)),
     "points only": replace(without_refinement(perturbed(mixed_problem())), fixed_views=np.ones(6, dtype=bool)),
+    "pixel scales": replace(perturbed(mixed_problem()), pixel_scale=np.array([1.0, 0.5, 3.0, 1.0, 2.0, 0.7])),
     "cameras only": replace(perturbed(mixed_problem()), fixed_points=np.ones(30, dtype=bool)),
 }
 

@@ -66,7 +66,7 @@ class BundleOptions:
     loss: LossName = "trivial"
     """Robust loss of the reprojection error."""
     loss_scale_px: float = 1.0
-    """Where the loss bends away from least squares."""
+    """Where the loss bends away from least squares, in pixels divided by the view's scale."""
     max_iterations: int = 100
     """Steps tried at most, accepted or not."""
     relative_tolerance: float = 1e-6
@@ -226,9 +226,9 @@ def _evaluate(solver: _Solver, before: Values, moved: Values, out: Linearization
         moved.points[behind] = before.points[behind]
         for p in behind:
             linearize_points_numba(
-                p, p + 1, layout.view, layout.point_start, layout.pixels, layout.camera_of_view, layout.model,
-                layout.active, layout.num_active, moved.R, moved.t, moved.points, moved.params, *solver.loss,
-                out.B, out.residual, out.J_camera, out.V, out.g_point, out.cost,
+                p, p + 1, layout.view, layout.point_start, layout.pixels, layout.scale_of_view, layout.camera_of_view,
+                layout.model, layout.active, layout.num_active, moved.R, moved.t, moved.points, moved.params,
+                *solver.loss, out.B, out.residual, out.J_camera, out.V, out.g_point, out.cost,
             )  # fmt: skip
             if not np.isfinite(out.cost[p]):
                 return np.inf

@@ -33,7 +33,8 @@ MAX_COLUMNS = 12_000
 class BundleCovariance:
     """Covariances at a minimum, for independent pixel errors of standard deviation `sigma_px` per axis.
 
-    Held views and points have zeros, what is not determined (a point seen once) has nan.
+    Where views have a pixel scale, that is of `sigma_px` times the scale. Held views and points have zeros, what is
+    not determined (a point seen once) has nan.
     """
 
     of_views: Float[np.ndarray, "v 6 6"]

@@ -36,6 +36,8 @@ class BundleLayout:
     slot: Int[np.ndarray, "o"]
     """-1 for observations of fixed views."""
     pixels: Float[np.ndarray, "o 2"]
+    scale_of_view: Float[np.ndarray, "v"]
+    """What residuals of each view are divided by."""
     point_start: Int[np.ndarray, "p_and_one"]
     listed_view: Int[np.ndarray, "l"]
     """The view of each slot, then the fixed views."""
@@ -115,6 +117,7 @@ def lay_out(problem: BundleProblem, usable: Bool[np.ndarray, "o"]) -> BundleLayo
         point=point,
         slot=slot_of_view[view],
         pixels=np.ascontiguousarray(problem.pixels[order], dtype=np.float64),
+        scale_of_view=np.ascontiguousarray(problem.scale_of_view, dtype=np.float64),
         point_start=point_start,
         listed_view=listed_view,
         list_start=list_start,

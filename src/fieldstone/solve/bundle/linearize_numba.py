@@ -21,7 +21,7 @@ from fieldstone.solve.projection.projection_numba import MAX_COEFFICIENTS, image
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def linearize_points_numba(
-    start, stop, view, point_start, pixels, camera_of_view, model, active, num_active,
+    start, stop, view, point_start, pixels, scale_of_view, camera_of_view, model, active, num_active,
     R, t, points, params, loss, scale2, B, residual, J_camera, V, g_point, cost,
 ):  # fmt: skip
     """Weighted residuals (o, 2), B (o, 2, 3), J_camera (o, 2, a), V (p, 6 lower), g_point (p, 3), cost (p,).
@@ -44,17 +44,19 @@ def linearize_points_numba(
             x = R[v, 0, 0] * X0 + R[v, 0, 1] * X1 + R[v, 0, 2] * X2 + t[v, 0]
             y = R[v, 1, 0] * X0 + R[v, 1, 1] * X1 + R[v, 1, 2] * X2 + t[v, 1]
             px, py = image_from_cam_numba(model[c], params[c], x, y, z, J, J_params, J_k)
-            rx = px - pixels[o, 0]
-            ry = py - pixels[o, 1]
+            scale = scale_of_view[v]
+            rx = (px - pixels[o, 0]) / scale
+            ry = (py - pixels[o, 1]) / scale
             rho, weight = robust_numba(loss, scale2, rx * rx + ry * ry)
             total += rho
-            w = np.sqrt(weight)
+            root = np.sqrt(weight)
+            w = root / scale
             for row in range(2):
                 a, b, e = w * J[row, 0], w * J[row, 1], w * J[row, 2]
                 b0 = a * R[v, 0, 0] + b * R[v, 1, 0] + e * R[v, 2, 0]
                 b1 = a * R[v, 0, 1] + b * R[v, 1, 1] + e * R[v, 2, 1]
                 b2 = a * R[v, 0, 2] + b * R[v, 1, 2] + e * R[v, 2, 2]
-                r = w * rx if row == 0 else w * ry
+                r = root * rx if row == 0 else root * ry
                 v00 += b0 * b0
                 v10 += b1 * b0
                 v11 += b1 * b1

@@ -42,8 +42,8 @@ def refine_points(problem: BundleProblem, options: BundleOptions | None = None) 
         initial_cost = linearize(layout, values, loss, at, workers)
         workers.over(
             refine_points_numba, workers.split(layout.point_start),
-            layout.view, layout.point_start, layout.pixels, layout.camera_of_view, layout.model, layout.active,
-            layout.num_active, values.R, values.t, values.points, values.params, *loss,
+            layout.view, layout.point_start, layout.pixels, layout.scale_of_view, layout.camera_of_view,
+            layout.model, layout.active, layout.num_active, values.R, values.t, values.points, values.params, *loss,
             options.max_iterations, options.relative_tolerance, layout.free_point,
             at.B, at.residual, at.J_camera, at.V, at.g_point, at.cost,
             np.empty_like(values.points), trial.V, trial.g_point, trial.cost,

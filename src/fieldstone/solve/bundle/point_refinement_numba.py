@@ -17,7 +17,7 @@ MAX_DAMPING = 1e8
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def refine_points_numba(
-    start, stop, view, point_start, pixels, camera_of_view, model, active, num_active,
+    start, stop, view, point_start, pixels, scale_of_view, camera_of_view, model, active, num_active,
     R, t, points, params, loss, scale2, max_iterations, tolerance, free_point,
     B, residual, J_camera, V, g_point, cost, trial, V_trial, g_trial, cost_trial,
 ):  # fmt: skip
@@ -27,7 +27,7 @@ def refine_points_numba(
     """
     for p in range(start, stop):
         linearize_points_numba(
-            p, p + 1, view, point_start, pixels, camera_of_view, model, active, num_active,
+            p, p + 1, view, point_start, pixels, scale_of_view, camera_of_view, model, active, num_active,
             R, t, points, params, loss, scale2, B, residual, J_camera, V, g_point, cost,
         )  # fmt: skip
         damping = START_DAMPING
@@ -44,7 +44,7 @@ def refine_points_numba(
             trial[p, 1] = points[p, 1] - (a2 * y1 + a4 * y2)
             trial[p, 2] = points[p, 2] - a5 * y2
             linearize_points_numba(
-                p, p + 1, view, point_start, pixels, camera_of_view, model, active, num_active,
+                p, p + 1, view, point_start, pixels, scale_of_view, camera_of_view, model, active, num_active,
                 R, t, trial, params, loss, scale2, B, residual, J_camera, V_trial, g_trial, cost_trial,
             )  # fmt: skip
             decrease = cost[p] - cost_trial[p]

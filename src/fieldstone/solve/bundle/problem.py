@@ -20,6 +20,9 @@ class BundleProblem:
     """Observation k says: view `view[k]` sees point `point[k]` at `pixels[k]`.
 
     refine: per camera, which of its parameters are free. Fixed views and points keep their values.
+    pixel_scale: per view, how many of its pixels count as one: residuals are divided by it before any loss. That is
+    the standard deviation of an observation, up to a common factor; a detector that worked on a photo reduced by s
+    sees its keypoints to s times as many pixels of the photo. None: one everywhere.
     """
 
     cameras: tuple[Camera, ...]
@@ -32,6 +35,7 @@ class BundleProblem:
     fixed_views: Bool[np.ndarray, "v"]
     fixed_points: Bool[np.ndarray, "p"]
     refine: tuple[Bool[np.ndarray, "_"], ...]
+    pixel_scale: Float[np.ndarray, "v"] | None = None
 
     def __post_init__(self) -> None:
         num_views, num_points = len(self.camera_of_view), len(self.points)
@@ -43,11 +47,21 @@ class BundleProblem:
             raise ValueError(f"an observation names a point outside 0..{num_points - 1}")
         if [len(mask) for mask in self.refine] != [len(camera.params) for camera in self.cameras]:
             raise ValueError("refine needs one mask per camera, as long as its parameters")
+        if self.pixel_scale is not None:
+            if self.pixel_scale.shape != (num_views,):
+                raise ValueError(f"{num_views} views need as many pixel scales, got {self.pixel_scale.shape}")
+            if not np.all((self.pixel_scale > 0) & np.isfinite(self.pixel_scale)):
+                raise ValueError("pixel scales must be positive and finite")
 
     @property
     def num_views(self) -> int:
         """Number of poses, fixed or free."""
         return len(self.camera_of_view)
+
+    @property
+    def scale_of_view(self) -> Float[np.ndarray, "v"]:
+        """`pixel_scale`, with the ones that None stands for."""
+        return np.ones(self.num_views) if self.pixel_scale is None else self.pixel_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +77,19 @@ class BundleJacobian:
 
 
 def reprojection_residuals(problem: BundleProblem) -> Float[np.ndarray, "o 2"]:
-    """Reprojected minus observed pixels; nan where a point is behind its camera."""
+    """Reprojected minus observed pixels, divided by the view's scale; nan where a point is behind its camera."""
     in_cam = problem.cam_from_world[problem.view].apply(problem.points[problem.point])
     out = np.empty_like(problem.pixels)
     for rows, camera in _rows_by_camera(problem):
         out[rows] = image_from_cam(camera, in_cam[rows]) - problem.pixels[rows]
-    return out
+    return out / problem.scale_of_view[problem.view, None]
 
 
 def reprojection_jacobian(problem: BundleProblem) -> tuple[Float[np.ndarray, "o 2"], BundleJacobian]:
     """Residuals and their derivatives at the current values.
 
-    With x = R X + t and the right update (R exp(omega), t + R v): dx/domega = -R [X]_x, dx/dv = R, dx/dX = R.
+    With x = R X + t and the right update (R exp(omega), t + R v): dx/domega = -R [X]_x, dx/dv = R, dx/dX = R; all
+    divided by the view's scale.
     """
     pose = problem.cam_from_world[problem.view]
     X = problem.points[problem.point]
@@ -88,9 +103,10 @@ def reprojection_jacobian(problem: BundleProblem) -> tuple[Float[np.ndarray, "o 
         pixels, by_cam_point[rows], J_params = image_from_cam_jacobian(camera, in_cam[rows])
         by_camera[rows, :, : len(camera.params)] = J_params
         residuals[rows] = pixels - problem.pixels[rows]
-    by_point = by_cam_point @ pose.R
+    scale = problem.scale_of_view[problem.view, None, None]
+    by_point = by_cam_point @ pose.R / scale
     by_pose = np.concatenate([-by_point @ skew(X), by_point], axis=2)
-    return residuals, BundleJacobian(by_pose, by_point, by_camera)
+    return residuals / scale[:, 0], BundleJacobian(by_pose, by_point, by_camera / scale)
 
 
 def updated(

@@ -235,8 +235,8 @@ def linearize(
     """Fill `out` with residuals, Jacobians and point blocks; returns the cost, inf if a point is behind a camera."""
     workers.over(
         linearize_points_numba, workers.split(layout.point_start),
-        layout.view, layout.point_start, layout.pixels, layout.camera_of_view, layout.model, layout.active,
-        layout.num_active, values.R, values.t, values.points, values.params, *loss,
+        layout.view, layout.point_start, layout.pixels, layout.scale_of_view, layout.camera_of_view,
+        layout.model, layout.active, layout.num_active, values.R, values.t, values.points, values.params, *loss,
         out.B, out.residual, out.J_camera, out.V, out.g_point, out.cost,
     )  # fmt: skip
     return float(np.sum(out.cost))

@@ -41,15 +41,20 @@ def match_data(
     pixels1: Float[np.ndarray, "m 2"],
     pixels2: Float[np.ndarray, "m 2"],
     rng: np.random.Generator,
+    pixel_scales: tuple[float, float] = (1.0, 1.0),
 ) -> MatchData:
-    """Matches whose pixels are finite and lie in the range of the lens models, in random order."""
+    """Matches whose pixels are finite and lie in the range of the lens models, in random order.
+
+    Args:
+        pixel_scales: How many pixels of each photo count as one in its errors.
+    """
     uv1, uv2 = plane_from_image(camera1, pixels1), plane_from_image(camera2, pixels2)
     usable = np.flatnonzero(np.isfinite(uv1).all(axis=1) & np.isfinite(uv2).all(axis=1))
     rows = usable[rng.permutation(len(usable))]
     columns = np.empty((6, len(rows)))
     columns[:2], columns[2:4] = uv1[rows].T, uv2[rows].T
-    columns[4] = pixel_size_squared(camera1, columns[:2].T)
-    columns[5] = pixel_size_squared(camera2, columns[2:4].T)
+    columns[4] = pixel_size_squared(camera1, columns[:2].T) * pixel_scales[0] ** 2
+    columns[5] = pixel_size_squared(camera2, columns[2:4].T) * pixel_scales[1] ** 2
     return MatchData(columns, rows, len(pixels1))
 
 

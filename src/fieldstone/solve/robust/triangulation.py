@@ -36,7 +36,8 @@ def triangulate_robust(
 
     Args:
         cam_from_world: Poses, batch v.
-        focal: Mean focal length of each view in pixels.
+        focal: Mean focal length of each view in pixels; divided by a view's pixel scale where `max_error_px` is to
+            mean so many pixels of that view.
         view, uv: View and ideal coordinates of every observation, tracks one after the other.
         starts: Track p holds the observations starts[p] to starts[p + 1].
         min_angle: Radians; the inliers of an accepted point hold two rays that meet at this angle at least.

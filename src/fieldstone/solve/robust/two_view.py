@@ -63,6 +63,7 @@ def estimate_two_view(
     rng: np.random.Generator,
     *,
     quality: Float[np.ndarray, "m"] | None = None,
+    pixel_scales: tuple[float, float] = (1.0, 1.0),
 ) -> TwoView:
     """Geometry of two photos from their matches, by locally optimised RANSAC.
 
@@ -73,6 +74,8 @@ def estimate_two_view(
 
     Args:
         quality: Higher is better; good matches are then sampled first (PROSAC).
+        pixel_scales: How many pixels of each photo count as one in its errors, so that one threshold serves photos
+            whose keypoints were found at different scales.
 
     Raises:
         ValueError: Different numbers of pixels.
@@ -83,7 +86,7 @@ def estimate_two_view(
     """
     if len(pixels1) != len(pixels2):
         raise ValueError(f"matches need one pixel in each photo, got {len(pixels1)} and {len(pixels2)}")
-    matches = match_data(camera1, camera2, pixels1, pixels2, rng)
+    matches = match_data(camera1, camera2, pixels1, pixels2, rng, pixel_scales)
     if len(matches.rows) < max(options.min_inliers, 8):
         return degenerate(len(pixels1))
     ranked = None if quality is None else np.argsort(-quality[matches.rows], kind="stable")
