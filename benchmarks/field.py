@@ -92,7 +92,7 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
     tiny, decay = np.float32(1e-8), np.float32(plan.decay)
 
     def draw() -> None:
-        draw_rays(training.rays, training.projection, gains, state.cursor, count, 0, background, rays, 0)
+        draw_rays(training.rays, training.space, gains, state.cursor, count, 0, background, rays, 0)
 
     def march() -> tuple[int, int, int]:
         return march_rays(

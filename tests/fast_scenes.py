@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fieldstone.field.base.projection import no_projection
 from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import PosedImage
+from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.decoder import decoder_width, initial_decoder
 from fieldstone.field.grid.field import FastField
 from fieldstone.field.grid.layout import grid_layout
@@ -49,7 +49,7 @@ def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
     decoder = initial_decoder(decoder_width(max_levels), rng)
     for weights in decoder:
         weights += rng.normal(scale=0.1, size=weights.shape).astype(np.float32)
-    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, False, 0.0, no_projection())
+    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, 0.0, box_space())
 
 
 def random_rays(rng, field, count):

@@ -9,6 +9,7 @@ from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.radiance_field import FieldTraining
+from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.field import compress, expand, field_from_tensors, occupancy_box, reachable_vertices
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.field.grid.occupancy_numba import rays_that_hit
@@ -97,7 +98,7 @@ def test_a_ball_is_learned_in_seconds(use_alpha):
     assert rendered.opacity[0] < 0.05
 
 
-def test_a_scene_with_points_is_unbounded():
+def test_a_scene_with_points_is_contracted():
     """Cameras around an object, and points: everything beyond the box is contracted into a shell."""
     images = tuple(
         replace(image, pixels=image.pixels[..., :3] * (image.pixels[..., 3:] // 255)) for image in ball_images(20)
@@ -108,7 +109,7 @@ def test_a_scene_with_points_is_unbounded():
     plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
         work = fast_training(images[1:], dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False)
-        assert work.unbounded
+        assert work.space.is_contracted
         state, _ = run(work, work.start(), plan.total_steps)
         image = images[0]
         rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
@@ -206,7 +207,7 @@ def test_no_ray_that_meets_a_cell_is_left_out(focal, cells):
     occupied = np.zeros((cells,) * 3, dtype=bool)
     occupied[tuple(rng.integers(2, cells - 2, (3, 40)))] = True
     occupancy = Occupancy(np.full(3, -1.5), 3.0 / cells, occupied)
-    box = occupancy_box(occupancy, occupancy.extent, False)
+    box = occupancy_box(occupancy, occupancy.extent, box_space())
     for image in ball_images(4, Camera("SIMPLE_PINHOLE", 81, 50, np.array([focal, 40.5, 25.0]))):
         rays = rays_from_view(image.camera, image.cam_from_world)
         center = rays.origins[0].astype(np.float32)

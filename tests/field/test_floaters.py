@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from fieldstone.field.base.projection import no_projection
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.evidence.floaters import places_in_box, without_floaters
+from fieldstone.field.base.space import box_space, contracted_space, grid_from_normalized
+from fieldstone.field.evidence.floaters import without_floaters
 from fieldstone.field.evidence.free_space import corners_in_world
 from fieldstone.field.grid.occupancy import Occupancy, full_box
 from fieldstone.geometry.sim3 import Sim3
@@ -25,7 +25,7 @@ def test_specks_go_with_their_rim_and_nothing_else(scene):
     occupancy, solid, places = scene
     expected = np.ones_like(solid)
     expected[(slice(7, 11),) * 3] = False
-    found = without_floaters(occupancy, solid, places, unbounded=True)
+    found = without_floaters(occupancy, solid, places, contracted_space())
     np.testing.assert_array_equal(found.cells, expected)
 
 
@@ -33,7 +33,7 @@ def test_in_a_bounded_box_nothing_is_far_away(scene):
     occupancy, solid, places = scene
     solid[WALL] = False
     solid[0, 4, 4:6] = True
-    found = without_floaters(occupancy, solid, places, unbounded=False)
+    found = without_floaters(occupancy, solid, places, box_space())
     assert not found.cells[0, 4, 4:6].any()
     assert found.cells[THING].all()
 
@@ -41,29 +41,28 @@ def test_in_a_bounded_box_nothing_is_far_away(scene):
 def test_a_point_beside_a_piece_ties_it(scene):
     occupancy, solid, _ = scene
     beside = occupancy.lower + 0.25 * (np.array([[10, 9, 9]]) + 0.5)
-    found = without_floaters(occupancy, solid, beside, unbounded=True)
+    found = without_floaters(occupancy, solid, beside, contracted_space())
     assert found.cells[SPECK].all()
     assert not found.cells[THING].any()
 
 
 def test_points_that_would_cost_the_scene_most_of_it_are_not_believed(scene):
     occupancy, solid, places = scene
-    assert without_floaters(occupancy, solid, places, unbounded=False) is occupancy
+    assert without_floaters(occupancy, solid, places, box_space()) is occupancy
 
 
 def test_points_outside_and_at_infinity_tie_nothing(scene):
     occupancy, solid, places = scene
     strange = np.vstack([places, np.full((1, 3), 50.0), np.full((1, 3), np.nan)])
-    found = without_floaters(occupancy, solid, strange, unbounded=True)
-    np.testing.assert_array_equal(found.cells, without_floaters(occupancy, solid, places, unbounded=True).cells)
+    found = without_floaters(occupancy, solid, strange, contracted_space())
+    np.testing.assert_array_equal(found.cells, without_floaters(occupancy, solid, places, contracted_space()).cells)
 
 
 def test_places_are_where_the_corners_of_cells_come_from():
     frame = FieldFrame(Sim3(0.5, np.eye(3), np.array([0.1, -0.2, 0.3])), 0.1, 9.0, np.zeros(3))
     box = full_box(np.full(3, -3.0), np.full(3, 6.0), 8)
-    corners = corners_in_world(box, frame, no_projection(), unbounded=True)[1:-1, 1:-1, 1:-1]  # the outermost: infinity
-    places = places_in_box(
-        frame.normalized_from_world.apply(corners.reshape(-1, 3)), no_projection(), unbounded=True
-    ).reshape(corners.shape)
+    corners = corners_in_world(box, frame, contracted_space())[1:-1, 1:-1, 1:-1]  # the outermost: infinity
+    normalized = frame.normalized_from_world.apply(corners.reshape(-1, 3))
+    places = grid_from_normalized(contracted_space(), normalized).reshape(corners.shape)
     index = np.stack(np.meshgrid(*(np.arange(1, 8),) * 3, indexing="ij"), axis=-1)
     np.testing.assert_allclose(places, box.lower + index * box.cell_size, atol=1e-9)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from fast_scenes import CAMERA, FRAME
-from fieldstone.field.base.projection import no_projection, project_points, projection_for
+from fieldstone.field.base.projection import projection_for
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
-from fieldstone.field.evidence.floaters import places_in_box
+from fieldstone.field.base.space import contracted_space, grid_from_normalized, projective_space
 from fieldstone.field.evidence.free_space import (
     FREE_SHARE,
     PROBABLE_SHARE,
@@ -40,17 +40,17 @@ def wall_scene(count):
     return images, seen
 
 
-def box(unbounded):
-    reach = NORMALIZED_RADIUS * (2 if unbounded else 1)
-    return full_box(np.full(3, -reach), np.full(3, 2 * reach), 48)
+def box():
+    """All of contracted space."""
+    return full_box(np.full(3, -2 * NORMALIZED_RADIUS), np.full(3, 4 * NORMALIZED_RADIUS), 48)
 
 
 def carved_before_wall(count):
     """What the photos of the wall see of it, the box before carving and after, and the corners of its cells."""
     images, seen = wall_scene(count)
-    start = box(True)
-    carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
-    return seen, start, carved.cells, corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    start = box()
+    carved = carve_free_space(start, images, FRAME, seen, contracted_space(), WORKER)
+    return seen, start, carved.cells, corners_in_world(start, FRAME, contracted_space())
 
 
 def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
@@ -59,7 +59,7 @@ def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
     # Cells that hold a point of the wall are kept.
     for points in seen.values():
         before_plane = 0.999 * points.xyz  # the wall itself is a plane that cells share
-        places = places_in_box(FRAME.normalized_from_world.apply(before_plane), no_projection(), unbounded=True)
+        places = grid_from_normalized(contracted_space(), FRAME.normalized_from_world.apply(before_plane))
         assert cells[tuple(((places - start.lower) / start.cell_size).astype(int).T)].all()
     # A cell in front of all cameras, well before the wall, is free, and so is one behind them; one beyond it is not.
     with np.errstate(invalid="ignore"):
@@ -73,9 +73,9 @@ def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
 
 def test_photos_without_points_carve_nothing():
     images, _ = wall_scene(2)
-    start = box(True)
+    start = box()
     few = {"0": SeenPoints(np.array([[0.0, 0, WALL]]), np.array([0.01]))}
-    carved = carve_free_space(start, images, FRAME, few, no_projection(), WORKER, unbounded=True)
+    carved = carve_free_space(start, images, FRAME, few, contracted_space(), WORKER)
     np.testing.assert_array_equal(carved.cells, start.cells)
 
 
@@ -98,9 +98,9 @@ def test_what_too_few_photos_see_from_near_is_not_there():
     aside = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
     images[-1] = PosedImage("8", CAMERA, aside, PIXELS)
     seen["8"] = SeenPoints(aside.inverse().apply(seen["0"].xyz), seen["0"].sigma)
-    start = box(True)
-    carved = carve_free_space(start, images, FRAME, seen, no_projection(), WORKER, unbounded=True)
-    corners = corners_in_world(start, FRAME, no_projection(), unbounded=True)
+    start = box()
+    carved = carve_free_space(start, images, FRAME, seen, contracted_space(), WORKER)
+    corners = corners_in_world(start, FRAME, contracted_space())
     behind = np.linalg.norm(np.nan_to_num(corners[:-1, :-1, :-1], nan=1e9) - [0.0, 0.0, -0.95 * WALL], axis=-1)
     assert not carved.cells.reshape(-1)[np.argmin(behind)]
     beyond = np.linalg.norm(np.nan_to_num(corners[:-1, :-1, :-1], nan=1e9) - [0.0, 0.0, -2.0 * WALL], axis=-1)
@@ -111,13 +111,14 @@ def test_what_too_few_photos_see_from_near_is_not_there():
 def test_corners_come_back_to_the_grid(projected):
     """The corners, put back into the space of the grid, lie on the grid; infinity is nan."""
     images, seen = wall_scene(3)
-    projection, start = no_projection(), box(True)
+    space, start = contracted_space(), box()
     if projected:
         found = projection_for(images, FRAME, seen["0"].xyz)
         assert found is not None
         projection, bounds = found
+        space = projective_space(projection)
         start = full_box(bounds[0], bounds[1] - bounds[0], 16)
-    corners = corners_in_world(start, FRAME, projection, unbounded=not projected)
+    corners = corners_in_world(start, FRAME, space)
     grid = start.lower + start.cell_size * np.stack(
         np.meshgrid(*(np.arange(n) for n in corners.shape[:3]), indexing="ij"), axis=-1
     )
@@ -125,11 +126,7 @@ def test_corners_come_back_to_the_grid(projected):
     assert 0.5 < finite.mean() <= 1.0
     if projected:
         finite &= corners[..., 2] < 1e3
-        again = project_points(projection, corners[finite])
-    else:
-        x = corners[finite] / NORMALIZED_RADIUS
-        m = np.abs(x).max(axis=1, keepdims=True)
-        again = NORMALIZED_RADIUS * np.where(m > 1, (2 - 1 / np.maximum(m, 1)) / np.maximum(m, 1), 1.0) * x
+    again = grid_from_normalized(space, corners[finite])
     np.testing.assert_allclose(again, grid[finite], atol=1e-5)
 
 

@@ -5,6 +5,7 @@ import pytest
 from numba import njit
 
 from fast_scenes import CAMERA, RADIUS, ball_images
+from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.march_numba import distance_at
 from fieldstone.field.grid.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
@@ -35,7 +36,7 @@ def look_up(box, shape):
 def test_kernels_find_the_distance_of_every_cell(shape):
     cells = np.random.default_rng(0).random(shape) < 0.02
     occupancy = Occupancy(np.zeros(3), 0.5, cells)
-    box = occupancy_box(occupancy, occupancy.extent, False)
+    box = occupancy_box(occupancy, occupancy.extent, box_space())
     np.testing.assert_array_equal(look_up(box, shape), cell_distances(cells))
 
 

@@ -9,6 +9,7 @@ import pytest
 from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.space import contracted_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.field.grid.rays import ray_table
@@ -125,7 +126,7 @@ def test_what_masks_leave_out_is_not_learned():
         masked.append(replace(image, pixels=pixels, keep=keep))
     with ThreadPoolExecutor(1) as executor:
         box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
-        rays = ray_table(tuple(masked), FRAME, occupancy_box(box, box.extent, True), executor)
+        rays = ray_table(tuple(masked), FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
     assert len(rays.image) == len(images) * 26 * CAMERA.height
     assert not np.any((rays.rgba[:, 1] == 255) & (rays.rgba[:, 0] == 0))
 
@@ -144,7 +145,7 @@ def test_rays_of_distorted_photos_are_exact(model, lens):
     )
     box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
     with ThreadPoolExecutor(1) as executor:
-        table = ray_table(images, FRAME, occupancy_box(box, box.extent, True), executor)
+        table = ray_table(images, FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
     d = np.einsum("nij,nj->ni", table.rotations[table.image], table.bearings[table.bearing]).astype(np.float64)
     for v, image in enumerate(images):
         rows = table.image == v

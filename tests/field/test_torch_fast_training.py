@@ -10,6 +10,7 @@ from fast_scenes import CAMERA, FRAME, RADIUS, ball_image, ball_images, random_f
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.radiance_field import FieldTraining
 from fieldstone.field.base.ray_dataset import SeenPoints
+from fieldstone.field.base.space import box_space, contracted_space
 from fieldstone.field.grid.decoder import Decoder
 from fieldstone.field.grid.exposure import Exposure
 from fieldstone.field.grid.field import FOREVER, field_from_tensors, renderer, room_for_samples
@@ -69,7 +70,7 @@ def photographed(scene, executor, plan=None):
         images[1:], replace(FRAME, background=np.zeros(3)), plan or OPEN, seed=0, executor=executor,
         points_in_world=points, seen=seen_by(images, points), bounded=False,
     )  # fmt: skip
-    assert work.projection.active == (scene == "forward")
+    assert work.space.is_projective == (scene == "forward")
     return work, images[0]
 
 
@@ -134,7 +135,7 @@ def test_gradients_match_autograd_of_the_dense_twin():
     origins, directions = (torch.tensor(a) for a in random_rays(rng, field, 60))
     velocity = np.zeros_like(field.table)
     grid = torch_grid(field.layout, field.table, velocity, CPU)
-    box = torch_box(field.occupancy, field.layout.extent, False, CPU)
+    box = torch_box(field.occupancy, field.layout.extent, box_space(), CPU)
     samples = march_packed(grid, box, march, origins, directions, torch.full((60,), 0.3), 1 << 20)
     samples = replace(samples, points=samples.points.double(), distance=samples.distance.double())
     samples = replace(samples, veil=samples.veil.double(), veil_behind=samples.veil_behind.double())
@@ -176,12 +177,12 @@ def test_gradients_match_autograd_of_the_dense_twin():
         assert close(actual.reshape(-1), of_group.reshape(-1), 1e-9)
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("space", [box_space(), contracted_space(0.5)], ids=["box", "contracted"])
 @pytest.mark.parametrize("min_weight", [0.0, 2e-2])
-def test_samples_are_those_of_the_kernels(unbounded, min_weight):
+def test_samples_are_those_of_the_kernels(space, min_weight):
     """Same places, and the same light at each, of which some was taken by samples that are left out."""
     rng = np.random.default_rng(1)
-    field = replace(random_field(rng, raw_offset=-1.5), unbounded=unbounded, near=0.1)
+    field = replace(random_field(rng, raw_offset=-1.5), space=space, near=0.1)
     cells = rng.random(field.occupancy.cells.shape) < 0.4
     field = replace(field, occupancy=Occupancy(field.occupancy.lower, field.occupancy.cell_size, cells))
     origins, directions = random_rays(rng, field, 200)
@@ -196,7 +197,7 @@ def test_samples_are_those_of_the_kernels(unbounded, min_weight):
     )  # fmt: skip
     assert num_rays == 200
     grid = torch_grid(field.layout, field.table, np.zeros_like(field.table), CPU)
-    box = torch_box(field.occupancy, field.layout.extent, unbounded, CPU)
+    box = torch_box(field.occupancy, field.layout.extent, space, CPU)
     rays = (torch.tensor(origins), torch.tensor(directions), torch.tensor(jitter))
     found = march_packed(grid, box, march, *rays, 1 << 15)
     np.testing.assert_array_equal(found.ray.numpy(), kernel.ray[:n])

@@ -266,13 +266,13 @@ def _open(
     focal = float(np.median([np.mean(image.camera.focal) for image in dataset.train]))
     extent = float(np.max(training.occupancy.extent))
     pixel_size = float(np.median(distances) / focal)
-    if training.projection.active:
+    if training.space.is_projective:
         pixel_size = 1.0 / focal
     finest = finest_for(budget_s, extent, pixel_size)
-    if training.unbounded:
+    if training.space.is_contracted:
         finest = min(2 * finest, MAX_UNBOUNDED)
     finest = min(finest, _finest_in_memory(training, dataset.train, memory_gib))
-    plan = first_plan(finest, budget_s, bounded=not (training.unbounded or training.projection.active))
+    plan = first_plan(finest, budget_s, bounded=not training.space.is_open)
     return replace(training, plan=replace(plan, refine_poses=refine_poses))
 
 

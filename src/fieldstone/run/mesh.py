@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.field.base.projection import project_points, unproject_points
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_world, surface_depth
+from fieldstone.field.base.space import finite_box, grid_from_normalized, normalized_from_grid
 from fieldstone.field.grid.field import FastField, field_from_tensors, renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
@@ -40,9 +40,6 @@ MAX_CELLS = 320
 
 LENGTH_CELLS = 2.0
 """The light that this many cells of the finest level stop decides what is solid."""
-
-MAX_DEPTH_SHARE = 0.97
-"""In a projective space, what lies nearer to infinity has no surface."""
 
 FUSED_VIEWS, FUSED_SIZE_PX = 48, 400
 """How many photos' views, at which size, say where the surface lies."""
@@ -140,17 +137,13 @@ def normalized_mesh(
     """The coloured mesh of a field in normalised coordinates, and the number of floaters removed.
 
     Marching cubes runs in the space of the grids; vertices then leave a projective space, where there is one. Of an
-    unbounded scene, what lies beyond the box is left out.
+    open scene, what lies beyond the box is left out.
 
     Args:
         render_rays: The field, in the world.
     """
-    open_scene = field.unbounded or field.projection.active
-    lower, upper = field.occupancy.lower, field.occupancy.lower + field.layout.extent
-    if field.unbounded:
-        lower, upper = lower + 0.25 * field.layout.extent, upper - 0.25 * field.layout.extent
-    if field.projection.active:
-        upper = np.append(upper[:2], MAX_DEPTH_SHARE * field.projection.depth)
+    space = field.space
+    lower, upper = finite_box(space, field.occupancy.lower, field.occupancy.lower + field.layout.extent)
     finest = float(field.layout.spacings[-1])
     spacing = max(finest, float(np.max(upper - lower)) / (cells or MAX_CELLS))
     if cells is not None:
@@ -160,7 +153,8 @@ def normalized_mesh(
 
     def position(index: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         points = lower + spacing * index
-        return world.apply(unproject_points(field.projection, points) if field.projection.active else points)
+        # The finite part of a contracted space is space as it is.
+        return world.apply(normalized_from_grid(space, points) if space.is_projective else points)
 
     def views() -> Iterator[tuple[Camera, Rigid3, Float[np.ndarray, "h w"]]]:
         for camera, pose in compared_views(header, poses, FUSED_VIEWS, FUSED_SIZE_PX, enlarge=True):
@@ -169,16 +163,16 @@ def normalized_mesh(
 
     share, more = cleaned(fused(share, level, position, views()), SURFACE)
     floaters += more
-    mesh = surface(share, SURFACE, lower, spacing, closed=not open_scene)
+    mesh = surface(share, SURFACE, lower, spacing, closed=not space.is_open)
     logger.info("surface of %d faces, %d floaters removed", len(mesh.faces), floaters)
     centers = frame.normalized_from_world.apply(poses.target_origin_in_source())
-    if not field.projection.active:
+    if not space.is_projective:
         return colored(mesh, field.color, centers, COLOR_CELLS * finest), floaters
 
     def color(points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        return field.color(np.clip(project_points(field.projection, points), lower, upper - 1e-6), directions)
+        return field.color(np.clip(grid_from_normalized(space, points), lower, upper - 1e-6), directions)
 
-    mesh = Mesh(unproject_points(field.projection, mesh.vertices), mesh.faces)
+    mesh = Mesh(normalized_from_grid(space, mesh.vertices), mesh.faces)
     return colored(mesh, color, centers, 0.0), floaters
 
 

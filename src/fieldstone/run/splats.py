@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fieldstone.evaluate.image_metrics import psnr, quantize
-from fieldstone.field.base.projection import project_points
 from fieldstone.field.base.radiance_field import FieldFrame, in_world
+from fieldstone.field.base.space import grid_from_normalized
 from fieldstone.field.grid.decoder import decode
 from fieldstone.field.grid.field import FastField, renderer
 from fieldstone.field.grid.interpolation_numba import interpolate_numba
@@ -101,11 +101,11 @@ def splats_of_mesh(mesh: Mesh, field: FastField, frame: FieldFrame, poses: Rigid
 
     def colors_from(points: Float[np.ndarray, "n 3"]) -> Callable[[np.ndarray], np.ndarray]:
         inside = world.apply(points)
-        if field.projection.active:
-            inside = project_points(field.projection, inside)
+        if field.space.is_projective:
+            inside = grid_from_normalized(field.space, inside)
         local = np.clip(inside - field.occupancy.lower, 0.0, upper)
         features = interpolate_numba(grid, np.ascontiguousarray(local, dtype=np.float32)).astype(np.float64)
         return lambda directions: decode(field.decoder, features, directions @ world.R.T)
 
-    depth = 0.0 if field.projection.active else COLOR_CELLS * finest / world.scale
+    depth = 0.0 if field.space.is_projective else COLOR_CELLS * finest / world.scale
     return splats_of_surface(mesh, colors_from, poses.target_origin_in_source(), depth)

@@ -33,9 +33,8 @@ MARGIN = 1.02
 
 
 class Projection(NamedTuple):
-    """The space, relative to normalised coordinates; inactive: space as it is."""
+    """The space, relative to normalised coordinates."""
 
-    active: bool
     R: np.ndarray
     """float32 (3, 3): mean camera axes from normalised axes."""
     center: np.ndarray
@@ -45,8 +44,8 @@ class Projection(NamedTuple):
 
 
 def no_projection() -> Projection:
-    """Space as it is."""
-    return Projection(False, np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.float32(1), np.float32(1))
+    """What stands in for a projection where there is none."""
+    return Projection(np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.float32(1), np.float32(1))
 
 
 def projection_for(
@@ -87,7 +86,7 @@ def projection_for(
     middle, half = (low + high) / 2, MARGIN * (high - low) / 2
     depth = DEPTH_SHARE * float(2 * half.max())
     bounds = np.array([[*(middle - half), 0.0], [*(middle + half), depth]])
-    projection = Projection(True, R.astype(np.float32), center.astype(np.float32), np.float32(near), np.float32(depth))
+    projection = Projection(R.astype(np.float32), center.astype(np.float32), np.float32(near), np.float32(depth))
     return projection, bounds
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
-from fieldstone.field.base.projection import Projection, project_points
-from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
+from fieldstone.field.base.space import Space
 from fieldstone.field.grid.occupancy import Occupancy, grown_by_one
 
 MOST_FLOATING = 0.3
@@ -21,28 +20,11 @@ CORNERS_TOO = np.ones((3, 3, 3))
 """Cells that share a corner touch."""
 
 
-def places_in_box(
-    points: Float[np.ndarray, "p 3"], projection: Projection, *, unbounded: bool
-) -> Float[np.ndarray, "p 3"]:
-    """Where points of the frame lie in the space of the grids.
-
-    Args:
-        unbounded: What is beyond the box is contracted, see `fast_march_numba.Box`.
-    """
-    if projection.active:
-        return project_points(projection, points)
-    if not unbounded:
-        return points
-    reach = np.maximum(np.abs(points).max(axis=1, keepdims=True) / NORMALIZED_RADIUS, 1.0)
-    return points / reach * (2.0 - 1.0 / reach)
-
-
 def without_floaters(
     occupancy: Occupancy,
     solid: Bool[np.ndarray, "x y z"],
     places: Float[np.ndarray, "p 3"],
-    *,
-    unbounded: bool,
+    space: Space,
 ) -> Occupancy:
     """The occupancy without the pieces of solid cells that are tied to nothing, and without the rim around them.
 
@@ -50,7 +32,7 @@ def without_floaters(
     far away is often seen without any point on it. Where `MOST_FLOATING` is exceeded, everything stays.
 
     Args:
-        places: Of known points, see `places_in_box`.
+        places: Of known points, in the grid.
     """
     shape = np.array(solid.shape)
     cell = np.floor((places - occupancy.lower) / occupancy.cell_size)
@@ -58,7 +40,7 @@ def without_floaters(
     ties = np.zeros(solid.shape, dtype=bool)
     ties[tuple(cell.T)] = True
     ties = grown_by_one(ties)
-    if unbounded:
+    if space.is_contracted:
         inner = np.zeros_like(ties)
         inner[tuple(slice(n // 4, n - n // 4) for n in solid.shape)] = True
         ties |= ~inner

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
-from fieldstone.field.base.projection import Projection, unproject_points
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.space import Space, normalized_from_grid
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.scene.rays import pixel_centers
@@ -52,10 +52,8 @@ def carve_free_space(
     images: Sequence[PosedImage],
     frame: FieldFrame,
     seen: Mapping[str, SeenPoints],
-    projection: Projection,
+    space: Space,
     executor: Executor,
-    *,
-    unbounded: bool,
 ) -> Occupancy:
     """The occupancy without cells that photos look through.
 
@@ -66,9 +64,8 @@ def carve_free_space(
 
     Args:
         seen: By name of the photo, in the world.
-        unbounded: What is beyond the box is contracted.
     """
-    corners = corners_in_world(occupancy, frame, projection, unbounded=unbounded)
+    corners = corners_in_world(occupancy, frame, space)
     places, shape = corners.reshape(-1, 3), corners.shape[:3]
 
     def of_photo(image: PosedImage) -> tuple[np.ndarray, ...]:
@@ -146,20 +143,14 @@ def least_distance(
     return least[i, j]
 
 
-def corners_in_world(
-    occupancy: Occupancy, frame: FieldFrame, projection: Projection, *, unbounded: bool
-) -> Float[np.ndarray, "x y z 3"]:
+def corners_in_world(occupancy: Occupancy, frame: FieldFrame, space: Space) -> Float[np.ndarray, "x y z 3"]:
     """Corners of the cells in the world; nan where they lie at infinity."""
     shape = tuple(n + 1 for n in occupancy.cells.shape)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
     points = occupancy.lower + index * occupancy.cell_size
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if projection.active:
-            points = unproject_points(projection, points)
-        elif unbounded:
-            reach = np.abs(points).max(axis=1, keepdims=True) / NORMALIZED_RADIUS
-            points = np.where(reach > 1, points / (reach * (2.0 - reach)), points)
-        points[~np.isfinite(points).all(axis=1) | (np.abs(points).max(axis=1) > FARTHEST)] = np.nan
+    points = normalized_from_grid(space, points)
+    finite = np.abs(points).max(axis=1, keepdims=True) <= FARTHEST  # False for nan too
+    points = np.where(finite, points, np.nan)
     return frame.normalized_from_world.inverse().apply(points).reshape(*shape, 3)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.field.base.projection import Projection, project_points, project_rays
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints, poses_in_frame
+from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, poses_in_frame
+from fieldstone.field.base.space import Space, along_rays
 from fieldstone.field.grid.rays import RayTable, coprime_stride
 from fieldstone.field.grid.terms_numba import PointRays
 from fieldstone.geometry.camera import image_from_cam
@@ -73,15 +73,12 @@ def known_rays(
     images: Sequence[PosedImage],
     frame: FieldFrame,
     seen: Mapping[str, SeenPoints],
-    projection: Projection,
-    *,
-    unbounded: bool,
+    space: Space,
 ) -> tuple[RayTable, PointRays]:
     """Rays from photos to the points that they see, the colours there, and how far along each ray its point lies.
 
     Args:
         seen: By name of the photo, in the world.
-        unbounded: What is beyond the box is contracted, and steps grow with the square of the distance.
     """
     rotations, centers = poses_in_frame(images, frame)
     world = frame.normalized_from_world
@@ -100,7 +97,7 @@ def known_rays(
         rgba = _colors(image.pixels, pixels[rows])
         rows, rgba = rows[rgba[:, 3] > 127], rgba[rgba[:, 3] > 127]
         xyz, sigma = world.apply(points.xyz[rows]), world.scale * points.sigma[rows]
-        along = np.stack(_along(projection, centers[v], xyz, sigma, unbounded))
+        along = np.stack(along_rays(space, centers[v], xyz, sigma))
         good = np.isfinite(along[0])
         bearings = in_cam[rows] / np.linalg.norm(in_cam[rows], axis=1, keepdims=True)
         parts.append((np.full(len(rows), v)[good], bearings[good], rgba[good], along[:, good]))
@@ -114,28 +111,6 @@ def known_rays(
         np.zeros(len(image), dtype=np.float32), coprime_stride(len(image)),
     )  # fmt: skip
     return table, PointRays(*along)
-
-
-def _along(
-    projection: Projection,
-    center: Float[np.ndarray, "3"],
-    points: Float[np.ndarray, "n 3"],
-    sigma: Float[np.ndarray, "n"],
-    unbounded: bool,
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Distance, its standard deviation and the stretch of steps, as rays are marched; nan outside of the space."""
-    offset = points - center
-    distance = np.linalg.norm(offset, axis=1)
-    if not projection.active:
-        reach = np.abs(points).max(axis=1) / NORMALIZED_RADIUS
-        return distance, sigma, np.maximum(reach, 1.0) ** 2 if unbounded else np.ones(len(points))
-    directions = offset / distance[:, None]
-    depth = (points - projection.center) @ projection.R[2]
-    start, _, length = project_rays(projection, np.broadcast_to(center, points.shape), directions)
-    there = np.linalg.norm(project_points(projection, points) - start, axis=1)
-    beyond = np.linalg.norm(project_points(projection, points + sigma[:, None] * directions) - start, axis=1)
-    there = np.where((depth > projection.near) & (there < length), there, np.nan)
-    return there, np.abs(beyond - there), np.ones(len(points))
 
 
 def _colors(pixels: np.ndarray, at_px: Float[np.ndarray, "n 2"]) -> np.ndarray:

@@ -12,8 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.errors import InputError
-from fieldstone.field.base.projection import Projection, distance_along, project_rays
+from fieldstone.field.base.projection import Projection
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays
+from fieldstone.field.base.space import (
+    Space,
+    box_space,
+    contracted_space,
+    expected_distance,
+    marched_rays,
+    projective_space,
+)
 from fieldstone.field.grid.decoder import HIDDEN, Decoder, decode
 from fieldstone.field.grid.decoder_numba import decode_directions, decode_numba
 from fieldstone.field.grid.interpolation_numba import interpolate_numba
@@ -52,11 +60,10 @@ class FastField:
     occupancy: Occupancy
     raw_offset: float
     step_cells: float
-    unbounded: bool
     near: float
     """Distance from the camera at which rays begin."""
-    projection: Projection
-    """The space that the grids live in."""
+    space: Space
+    """What the grids live in."""
 
     @property
     def width(self) -> int:
@@ -65,7 +72,7 @@ class FastField:
 
     def box(self) -> Box:
         """The occupancy as the kernels take it."""
-        return occupancy_box(self.occupancy, self.layout.extent, self.unbounded)
+        return occupancy_box(self.occupancy, self.layout.extent, self.space)
 
     def march(self, min_weight: float, min_light: float) -> March:
         """How rays are sampled, with the thresholds of the caller."""
@@ -109,6 +116,7 @@ class FastField:
         Args:
             reachable: `reachable_vertices` of this field, if they are known already.
         """
+        projection = self.space.projection
         return {
             "grid": compress(self, self.table, reachable_vertices(self) if reachable is None else reachable),
             "resolutions": np.array(self.layout.resolutions, dtype=np.int64),
@@ -116,15 +124,15 @@ class FastField:
             "cells": np.packbits(self.occupancy.cells.reshape(-1)),
             "cells_shape": np.array(self.occupancy.cells.shape, dtype=np.int64),
             "cells_box": np.append(self.occupancy.lower, self.occupancy.cell_size),
-            "sampling": np.array([self.raw_offset, self.step_cells, float(self.unbounded), self.near]),
-            "projection": np.array([self.projection.active, self.projection.near, self.projection.depth], np.float32),
-            "projection_R": self.projection.R,
-            "projection_center": self.projection.center,
+            "sampling": np.array([self.raw_offset, self.step_cells, float(self.space.is_contracted), self.near]),
+            "projection": np.array([self.space.is_projective, projection.near, projection.depth], np.float32),
+            "projection_R": projection.R,
+            "projection_center": projection.center,
             **{f"decoder_{name}": value for name, value in self.decoder._asdict().items()},
         }
 
 
-def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounded: bool) -> Box:
+def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], space: Space) -> Box:
     """An occupancy as the kernels take it.
 
     Args:
@@ -136,7 +144,7 @@ def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounde
         in_bricks(cell_distances(occupancy.cells)),
         np.array(occupancy.cells.shape, dtype=np.int64),
         np.float32(occupancy.cell_size),
-        unbounded,
+        space,
     )
 
 
@@ -153,15 +161,22 @@ def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> FastField:
         occupancy = Occupancy(lower_and_size[:3].copy(), float(lower_and_size[3]), cells)
         layout = grid_layout(tensors["extent"], tuple(tensors["resolutions"].tolist()))
         decoder = Decoder(**{name: tensors[f"decoder_{name}"].copy() for name in Decoder._fields})
-        active, near_plane, depth = tensors["projection"]
-        R, center = tensors["projection_R"].copy(), tensors["projection_center"].copy()
-        projection = Projection(bool(active), R, center, np.float32(near_plane), np.float32(depth))
-        raw_offset, step_cells, unbounded, near = tensors["sampling"].tolist()
+        raw_offset, step_cells, _, near = tensors["sampling"].tolist()
         empty = np.zeros(layout.num_values, dtype=np.float32)
-        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, bool(unbounded), near, projection)
+        space = _space_from_tensors(tensors)
+        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, near, space)
         return expand(field, tensors["grid"])
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"this checkpoint does not hold a fast field ({error}); delete it and train again") from error
+
+
+def _space_from_tensors(tensors: Mapping[str, np.ndarray]) -> Space:
+    projective, near, depth = tensors["projection"]
+    if projective:
+        R, center = tensors["projection_R"].copy(), tensors["projection_center"].copy()
+        return projective_space(Projection(R, center, np.float32(near), np.float32(depth)))
+    contracted = tensors["sampling"][2]
+    return contracted_space(0.25 * float(np.max(tensors["extent"]))) if contracted else box_space()
 
 
 def reachable_vertices(field: FastField) -> Bool[np.ndarray, "v"]:
@@ -288,9 +303,7 @@ def renderer(
     def render_with(tile: _Tile, rays: Rays) -> RenderedRays:
         count = len(rays)
         views = np.ascontiguousarray(rays.directions, dtype=np.float32)
-        origins, directions, lengths = rays.origins, rays.directions, np.full(count, far)
-        if field.projection.active:
-            origins, directions, lengths = project_rays(field.projection, rays.origins, rays.directions)
+        origins, directions, lengths = marched_rays(field.space, rays.origins, rays.directions)
         origins = np.ascontiguousarray(origins, dtype=np.float32)
         directions = np.ascontiguousarray(directions, dtype=np.float32)
         color, depth = np.empty((count, 3), np.float32), np.empty(count, np.float32)
@@ -310,12 +323,7 @@ def renderer(
                 samples, num_rays, first, passed, far, background, rgb, color[rows], depth[rows], opacity[rows]
             )
             done += num_rays
-        if field.projection.active:
-            # In the projected space a ray ends at its own length; the expected place goes back to a distance.
-            share = np.where(
-                lengths > 0, (depth - (1 - opacity) * far) / np.maximum(lengths, 1e-9) + (1 - opacity), 1.0
-            )
-            depth = np.minimum(distance_along(field.projection, rays.origins, rays.directions, share), far)
+        depth = expected_distance(field.space, rays.origins, rays.directions, lengths, depth, opacity, far)
         return RenderedRays(color, depth.astype(np.float32), opacity)
 
     def render(rays: Rays, /) -> RenderedRays:

@@ -12,6 +12,8 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
+from fieldstone.field.base.space import CONTRACTED, Space
+from fieldstone.field.base.space_numba import contract_numba
 from fieldstone.field.grid.interpolation_numba import interpolate_point_numba, prefetch_point
 from fieldstone.field.grid.simd_numba import at
 
@@ -23,11 +25,7 @@ MIN_RAW, MAX_RAW = np.float32(-7.0), np.float32(10.0)
 
 
 class Box(NamedTuple):
-    """Where there is something; coordinates are relative to the lower corner.
-
-    In an unbounded box, the inner half of each axis is space as it is, and the outer half is everything beyond:
-    u = x for |x| <= 1, u = (2 - 1 / |x|) x / |x| outside, |x| the largest coordinate in units of the inner box.
-    """
+    """Where there is something; coordinates are those of the grid, relative to the lower corner."""
 
     lower: np.ndarray
     extent: np.ndarray
@@ -39,7 +37,7 @@ class Box(NamedTuple):
     cells: np.ndarray
     """int64 (3)."""
     cell_size: np.float32
-    unbounded: bool
+    space: Space
 
 
 class March(NamedTuple):
@@ -112,7 +110,8 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
 
     jitter: share of a step before the first sample. far: where the ray ends at the latest.
     """
-    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    zero, one = np.float32(0), np.float32(1)
+    contracted = box.space.kind == CONTRACTED
     dx, dy, dz = at(directions, ray * 3), at(directions, ray * 3 + 1), at(directions, ray * 3 + 2)
     ex, ey, ez = at(box.extent, 0), at(box.extent, 1), at(box.extent, 2)
     ox, oy, oz = (
@@ -121,7 +120,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
         at(origins, ray * 3 + 2) - at(box.lower, 2),
     )
     t, t_end = march.near, np.float32(far)
-    if not box.unbounded:
+    if not contracted:
         t, t_end = cut_to_slab(ox, dx, zero, ex, t, t_end)
         t, t_end = cut_to_slab(oy, dy, zero, ey, t, t_end)
         t, t_end = cut_to_slab(oz, dz, zero, ez, t, t_end)
@@ -131,20 +130,15 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
     t += jitter * march.step
     nx, ny, nz = at(box.cells, 0), at(box.cells, 1), at(box.cells, 2)
     per_cell = one / box.cell_size
-    half = np.float32(0.25) * ex
     finest = grid.per_unit.shape[0] - 1
     asked, head, tail = 0, 0, 0
     while True:
         while t < t_end and tail - head < QUEUE:
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             stride = march.step
-            if box.unbounded:
-                cx, cy, cz = x / half - two, y / half - two, z / half - two
-                m = max(abs(cx), max(abs(cy), abs(cz)))
-                if m > one:
-                    s = (two - one / m) / m
-                    x, y, z = (two + cx * s) * half, (two + cy * s) * half, (two + cz * s) * half
-                    stride = march.step * m * m
+            if contracted:
+                x, y, z, reach = contract_numba(x, y, z, box.space.half_side)
+                stride = march.step * reach * reach
             x, y, z = min(max(x, zero), ex), min(max(y, zero), ey), min(max(z, zero), ez)
             i, j, k = (
                 min(np.int64(x * per_cell), nx - 1),
@@ -153,7 +147,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
             )
             distance = distance_at(box, i, j, k)
             if distance > 0:
-                if box.unbounded:
+                if contracted:
                     t += stride
                 else:
                     t += march.step * steps_out_of_cell(box, march.step, distance, i, j, k, x, y, z, dx, dy, dz)

@@ -49,7 +49,7 @@ def ray_table(
     use_alpha: bool = True,
     free_of: Callable[[PosedImage], Float[np.ndarray, "p"]] | None = None,
 ) -> RayTable:
-    """The table of all pixels whose rays meet an occupied cell, and some beside them (all, if the box is unbounded).
+    """The table of all pixels whose rays meet an occupied cell, and some beside them (all, in an open space).
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
@@ -69,7 +69,7 @@ def ray_table(
         keep = images[v].keep
         if keep is not None:
             reached &= keep.reshape(-1)
-        if not box.unbounded:
+        if not box.space.is_open:
             by_row = in_cam.reshape(camera.height, camera.width, 3)
             reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
         rows = np.flatnonzero(reached)

@@ -7,6 +7,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
+from fieldstone.field.base.space_numba import marched_ray_numba
 from fieldstone.field.grid.decoder import Decoder
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
 from fieldstone.field.grid.march_numba import Samples, composite_backward, march_rays
@@ -81,28 +82,6 @@ def random_share(seed, number):
     return np.float32(np.int64(h >> np.uint64(40))) * np.float32(1.0 / 16777216.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def project_ray_numba(projection, origins, directions, ray):
-    """`projection.project_rays` of one ray, in place, in flat arrays."""
-    o, d = np.empty(3, np.float32), np.empty(3, np.float32)
-    for a in range(3):
-        o[a], d[a] = 0, 0
-        for b in range(3):
-            o[a] += projection.R[a, b] * (origins[ray * 3 + b] - projection.center[b])
-            d[a] += projection.R[a, b] * directions[ray * 3 + b]
-    near = projection.near
-    if d[2] <= np.float32(1e-3):
-        origins[ray * 3], origins[ray * 3 + 1], origins[ray * 3 + 2] = o[0] / near, o[1] / near, 0
-        directions[ray * 3], directions[ray * 3 + 1], directions[ray * 3 + 2] = 0, 0, -1
-        return
-    x, y = (o[0] + (near - o[2]) / d[2] * d[0]) / near, (o[1] + (near - o[2]) / d[2] * d[1]) / near
-    dx, dy, dz = d[0] / d[2] - x, d[1] / d[2] - y, projection.depth
-    length = np.sqrt(dx * dx + dy * dy + dz * dz)
-    origins[ray * 3], origins[ray * 3 + 1], origins[ray * 3 + 2] = x, y, 0
-    directions[ray * 3], directions[ray * 3 + 1], directions[ray * 3 + 2] = dx / length, dy / length, dz / length
-
-
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def drawn_row(table, number):
@@ -113,7 +92,7 @@ def drawn_row(table, number):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def draw_rays(table, projection, gains, start, count, seed, background, rays, at):
+def draw_rays(table, space, gains, start, count, seed, background, rays, at):
     """Rays number `start` to `start + count` of the table's sequence, with colours over the background.
 
     They are put to place `at` and after. gains: (v, 3) flat, of each photo.
@@ -144,8 +123,7 @@ def draw_rays(table, projection, gains, start, count, seed, background, rays, at
         rays.point[n] = row
         rays.free[n] = table.free[row]
         rays.jitter[n] = random_share(seed, start + k)
-        if projection.active:
-            project_ray_numba(projection, rays.origins, rays.directions, n)
+        marched_ray_numba(space, rays.origins, rays.directions, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -158,7 +136,6 @@ def chunk_step(
     points,
     first_known,
     num_known,
-    projection,
     gains,
     seed,
     background,
@@ -179,8 +156,8 @@ def chunk_step(
     """
     rays, samples, work = chunk.rays, chunk.samples, chunk.work
     used = 4 * grid.per_unit.shape[0]
-    draw_rays(known, projection, gains, first_known, num_known, seed + 1, background, rays, 0)
-    draw_rays(table, projection, gains, start, count, seed, background, rays, num_known)
+    draw_rays(known, box.space, gains, first_known, num_known, seed + 1, background, rays, 0)
+    draw_rays(table, box.space, gains, start, count, seed, background, rays, num_known)
     rays.point[num_known : num_known + count] = -1
     num_rays, n, asked = march_rays(
         grid, box, march, rays.origins, rays.directions, rays.jitter, far, num_known + count, width, samples,

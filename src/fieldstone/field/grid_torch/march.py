@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fieldstone.field.base.space import Space
 from fieldstone.field.grid.field import FOREVER
 from fieldstone.field.grid.march_numba import MIN_RAW, March
 from fieldstone.field.grid.occupancy import Occupancy
@@ -20,7 +21,7 @@ PLACES_AT_ONCE = 1 << 22
 """Places on rays that are looked at together: about 300 MB."""
 
 LOOK_EVERY = 32
-"""Steps of an unbounded march between asking whether all rays have ended: asking waits for the device."""
+"""Steps of a march to infinity between asking whether all rays have ended: asking waits for the device."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class TorchBox:
     extent: Float[Tensor, "3"]
     cells: Bool[Tensor, "x y z"]
     cell_size: float
-    unbounded: bool
+    space: Space
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class PackedSamples:
 
     num_rays: int
     points: Float[Tensor, "n 3"]
-    """Relative to the lower corner of the box, contracted if it is unbounded."""
+    """In the grid, relative to the lower corner of the box."""
     distance: Float[Tensor, "n"]
     ray: Int[Tensor, "n"]
     veil: Float[Tensor, "n"]
@@ -49,11 +50,11 @@ class PackedSamples:
     """The same for whole rays."""
 
 
-def torch_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], unbounded: bool, device: torch.device) -> TorchBox:
+def torch_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], space: Space, device: torch.device) -> TorchBox:
     """As `fast_field.occupancy_box`, on a device."""
     lower, size = (torch.tensor(a.astype(np.float32), device=device) for a in (occupancy.lower, extent))
     cells = torch.tensor(occupancy.cells, device=device)
-    return TorchBox(lower, size, cells, float(occupancy.cell_size), unbounded)
+    return TorchBox(lower, size, cells, float(occupancy.cell_size), space)
 
 
 def march_packed(
@@ -97,15 +98,15 @@ def _places(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Int[Tensor, "n"]]:
     """Places in occupied cells, their distances and rays, ray by ray."""
     origins = origins - box.lower
-    distances_of = _unbounded_distances if box.unbounded else _bounded_distances
+    distances_of = _contracted_distances if box.space.is_contracted else _bounded_distances
     t, end = distances_of(box, march, origins, directions, jitter)
     parts = []
     at_once = max(PLACES_AT_ONCE // t.shape[1], 1)
     for first in range(0, len(origins), at_once):
         rows = slice(first, first + at_once)
         points = origins[rows, None] + t[rows, :, None] * directions[rows, None]
-        if box.unbounded:
-            points = _contracted(points, 0.25 * box.extent[0])
+        if box.space.is_contracted:
+            points = contracted(points, float(box.space.half_side))
         points = torch.minimum(points.clamp(min=0.0), box.extent)
         last = torch.tensor(box.cells.shape, device=points.device) - 1
         i, j, k = torch.minimum((points / box.cell_size).long(), last).unbind(dim=2)
@@ -138,7 +139,7 @@ def _bounded_distances(
     return begin[:, None] + (jitter[:, None] + number) * step, end
 
 
-def _unbounded_distances(
+def _contracted_distances(
     box: TorchBox,
     march: March,
     origins: Float[Tensor, "r 3"],
@@ -146,7 +147,7 @@ def _unbounded_distances(
     jitter: Float[Tensor, "r"],
 ) -> tuple[Float[Tensor, "r s"], Float[Tensor, "r"]]:
     """Distances of samples to infinity: beyond the inner box, steps grow with the square of the distance."""
-    half, step = 0.25 * box.extent[0], float(march.step)
+    half, step = float(box.space.half_side), float(march.step)
     o, d = origins / half - 2.0, directions / half
     t, out = float(march.near) + jitter * step, []
     while len(out) % LOOK_EVERY or bool((t < float(FOREVER)).any()):
@@ -156,8 +157,8 @@ def _unbounded_distances(
     return torch.stack(out, dim=1), torch.full_like(t, float(FOREVER))
 
 
-def _contracted(points: Float[Tensor, "r s 3"], half: Float[Tensor, ""]) -> Float[Tensor, "r s 3"]:
-    """Points of space in the box, see `fast_march_numba.Box`; both relative to its lower corner."""
-    c = points / half - 2.0
-    m = c.abs().amax(dim=2, keepdim=True).clamp(min=1.0)
-    return (2.0 + c * (2.0 - 1.0 / m) / m) * half
+def contracted(points: Float[Tensor, "r s 3"], half_side: float) -> Float[Tensor, "r s 3"]:
+    """`space_numba.contract_numba`."""
+    c = points / half_side - 2.0
+    reach = c.abs().amax(dim=2, keepdim=True).clamp(min=1.0)
+    return (2.0 + c * (2.0 - 1.0 / reach) / reach) * half_side

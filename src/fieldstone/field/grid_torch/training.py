@@ -176,7 +176,7 @@ class TorchFastTraining:
         return TorchFastState(
             host,
             torch_grid(field.layout, field.table, host.velocity, self.device),
-            torch_box(field.occupancy, field.layout.extent, field.unbounded, self.device),
+            torch_box(field.occupancy, field.layout.extent, field.space, self.device),
         )
 
     def _drawn(self, host: FastState, count: int, march: March) -> tuple[TorchRays, int]:
@@ -189,7 +189,7 @@ class TorchFastTraining:
         tables = ((host.known, host.cursor // RAYS_PER_KNOWN, num_known, work.seed + 1, 0),
                   (host.rays, host.cursor, count, work.seed, num_known))  # fmt: skip
         for table, start, number, seed, at in tables:
-            draw_rays(table, work.projection, gains, start, number, seed, background, rays, at)
+            draw_rays(table, work.space, gains, start, number, seed, background, rays, at)
         window = np.full((num_known + count, 2), -np.inf, dtype=np.float32)
         window[:num_known] = window_of(work.points, rays.point[:num_known], float(march.step))
         rays.free[:num_known] = 0.0

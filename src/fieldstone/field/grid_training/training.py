@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.field.base.projection import Projection, no_projection, projection_for
+from fieldstone.field.base.projection import projection_for
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, StepReport, in_world
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints, poses_in_frame
-from fieldstone.field.evidence.floaters import places_in_box, without_floaters
+from fieldstone.field.base.space import Space, box_space, contracted_space, grid_from_normalized, projective_space
+from fieldstone.field.evidence.floaters import without_floaters
 from fieldstone.field.evidence.free_space import carve_free_space, probably_free
 from fieldstone.field.evidence.pose_refinement import MovablePhoto, at_surfaces, movable_photos, moved_images, refined
 from fieldstone.field.evidence.sparse_depth import known_rays, no_known_rays
@@ -70,7 +71,7 @@ FOG = 1.2
 """Cells with less than this many times the density of the start are what no ray has asked for."""
 
 NEAR_SHARE = 0.5
-"""In an unbounded scene, rays begin at this share of the nearest distance of the frame."""
+"""In a contracted space, rays begin at this share of the nearest distance of the frame."""
 
 HULL_CELLS = 96
 """Cells of the visual hull along the longest side of the box."""
@@ -91,13 +92,12 @@ class FastTraining:
     frame: FieldFrame
     occupancy: Occupancy
     """Where something may be, before training."""
-    unbounded: bool
-    projection: Projection
+    space: Space
     plan: FastPlan
     seed: int
     executor: Executor
     places: Float[np.ndarray, "p 3"]
-    """Known points, in the space of the grids."""
+    """Known points, in the grid."""
     alpha_known: bool
     """Photos say themselves where they show the background."""
     movable: tuple[MovablePhoto, ...] = ()
@@ -116,11 +116,11 @@ class FastTraining:
         for level in range(layout.num_levels):
             vertices = layout.level(table, level)
             vertices[..., 1:] = rng.uniform(-0.01, 0.01, (*vertices.shape[:3], CHANNELS - 1))
-        near = NEAR_SHARE * self.frame.near if self.unbounded else 0.0
+        near = NEAR_SHARE * self.frame.near if self.space.is_contracted else 0.0
         # Fog that a step takes for empty teaches nothing: a fine grid, whose steps are short, has to start denser.
         visible = START_WEIGHTS * plan.min_weight / (plan.step_cells * REFERENCE_CELLS / layout.resolutions[-1])
         offset, step = max(plan.raw_offset, math.log(visible)), plan.step_cells
-        field = FastField(layout, table, decoder, occupancy, offset, step, self.unbounded, near, self.projection)
+        field = FastField(layout, table, decoder, occupancy, offset, step, near, self.space)
         zeros = Decoder(*(np.zeros_like(weights) for weights in decoder))
         rays = np.full(plan.num_chunks, plan.samples_per_chunk // 8, dtype=np.int64)
         square = Decoder(*(np.zeros_like(weights) for weights in decoder))
@@ -182,7 +182,7 @@ class FastTraining:
         def chunk(c: int) -> tuple[int, int, int, float]:
             return chunk_step(
                 state.rays, int(starts[c]), int(state.chunk_rays[c]), state.known, self.points,
-                int(starts[c]) // RAYS_PER_KNOWN, int(num_known[c]), self.projection, gains, self.seed, background,
+                int(starts[c]) // RAYS_PER_KNOWN, int(num_known[c]), gains, self.seed, background,
                 room.grid, room.box, room.march, FOREVER, terms, field.decoder, transposed, field.width,
                 room.chunks[c],
             )  # fmt: skip
@@ -258,7 +258,7 @@ class FastTraining:
 
     def _without_floaters(self, field: FastField) -> FastField:
         solid = self._denser(field, field.occupancy, SOLID / field.step_depth)
-        occupancy = without_floaters(field.occupancy, solid, self.places, unbounded=self.unbounded)
+        occupancy = without_floaters(field.occupancy, solid, self.places, self.space)
         cleared = np.count_nonzero(field.occupancy.cells) - np.count_nonzero(occupancy.cells)
         logger.debug("cleared %d cells around what hangs in the air", cleared)
         return replace(field, occupancy=occupancy)
@@ -340,7 +340,7 @@ def fast_training(
     """The training of a fast field on posed photos.
 
     The box is `NORMALIZED_RADIUS` around the origin of the frame. Where photos have alpha, it shrinks to the visual
-    hull. An unbounded scene whose photos look the same way gets a projective space; in others everything beyond the
+    hull. An open scene whose photos look the same way gets a projective space; in others everything beyond the
     box is contracted into a shell around it.
 
     Args:
@@ -354,10 +354,7 @@ def fast_training(
         InputError: No ray meets the scene.
     """
     points = np.empty((0, 3)) if points_in_world is None else points_in_world
-    projected = None if bounded else projection_for(images, frame, points)
-    unbounded = not bounded and projected is None
-    reach = NORMALIZED_RADIUS * (2.0 if unbounded else 1.0)
-    projection, bounds = projected or (no_projection(), np.array([[-reach] * 3, [reach] * 3]))
+    space, bounds = space_of(images, frame, points, bounded=bounded)
     occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2 if bounded else FREE_CELLS)
     alpha_known = use_alpha and all(image.pixels.shape[2] == 4 for image in images)
     if alpha_known and bounded:
@@ -374,18 +371,31 @@ def fast_training(
                 "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
             )
     if seen:
-        occupancy = carve_free_space(occupancy, images, frame, seen, projection, executor, unbounded=unbounded)
+        occupancy = carve_free_space(occupancy, images, frame, seen, space, executor)
         logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
-    all_rays = occupancy_box(occupancy, occupancy.extent, unbounded or projection.active)
-    free_of = probably_free(frame, seen) if seen and not projection.active else None
-    table = ray_table(images, frame, all_rays, executor, use_alpha=use_alpha, free_of=free_of)
-    known, on_rays = known_rays(images, frame, seen, projection, unbounded=unbounded) if seen else no_known_rays()
-    places = places_in_box(frame.normalized_from_world.apply(points), projection, unbounded=unbounded)
+    box = occupancy_box(occupancy, occupancy.extent, space)
+    free_of = probably_free(frame, seen) if seen and not space.is_projective else None
+    table = ray_table(images, frame, box, executor, use_alpha=use_alpha, free_of=free_of)
+    known, on_rays = known_rays(images, frame, seen, space) if seen else no_known_rays()
+    places = grid_from_normalized(space, frame.normalized_from_world.apply(points))
     movable = movable_photos(images, frame, seen) if refine_poses else ()
     return FastTraining(
-        table, known, on_rays, frame, occupancy, unbounded, projection, plan, seed, executor, places, alpha_known,
+        table, known, on_rays, frame, occupancy, space, plan, seed, executor, places, alpha_known,
         movable,
     )  # fmt: skip
+
+
+def space_of(
+    images: tuple[PosedImage, ...], frame: FieldFrame, points_in_world: Float[np.ndarray, "p 3"], *, bounded: bool
+) -> tuple[Space, Float[np.ndarray, "2 3"]]:
+    """The space that suits a scene, and the lower and upper corner of its grid."""
+    if bounded:
+        return box_space(), NORMALIZED_RADIUS * np.array([[-1.0] * 3, [1.0] * 3])
+    projected = projection_for(images, frame, points_in_world)
+    if projected is not None:
+        projection, bounds = projected
+        return projective_space(projection), bounds
+    return contracted_space(), 2.0 * NORMALIZED_RADIUS * np.array([[-1.0] * 3, [1.0] * 3])
 
 
 def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
