@@ -7,8 +7,8 @@ import pytest
 
 from fieldstone.cli import main
 from fieldstone.errors import InputError
-from fieldstone.field_verbs import seconds
 from fieldstone.io.images.photos import write_photo
+from fieldstone.run.options import seconds
 
 
 @pytest.fixture
@@ -67,5 +67,5 @@ def test_budgets(text, expected):
 
 @pytest.mark.parametrize("text", ["", "s", "-3s", "0", "nan", "infs", "3d"])
 def test_bad_budgets(text):
-    with pytest.raises(InputError, match="--budget"):
+    with pytest.raises(InputError, match="`budget_s`"):
         seconds(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class InputError(ValueError):
+class InputError(Exception):
     """Input that cannot be used: what, where, why, and what to do next, in one message.
 
     The command line prints the message without a traceback and ends with exit code 3.

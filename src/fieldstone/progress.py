@@ -16,9 +16,9 @@ class Progress:
 
     stage: str
     """What is being done, in words: `finding features`, `matching`, `training`."""
-    done: float = 0
+    done: float | int = 0
     """Units of the stage that are done: photos, pairs, steps, frames, or seconds of a budget."""
-    total: float | None = None
+    total: float | int | None = None
     """Units that there are; None where nobody knows."""
     seconds: float = 0.0
     """Wall seconds since the stage began."""
@@ -37,12 +37,12 @@ def silent(event: Progress) -> None:
 class StageProgress:
     """Counts the units of one stage and reports each; the first event says that the stage has begun."""
 
-    def __init__(self, on_progress: OnProgress, stage: str, total: float | None = None) -> None:
+    def __init__(self, on_progress: OnProgress, stage: str, total: float | int | None = None) -> None:
         self._on_progress, self._stage, self._total = on_progress, stage, total
-        self._done, self._started = 0.0, time.perf_counter()
+        self._done, self._started = 0, time.perf_counter()
         on_progress(Progress(stage, 0, total))
 
-    def at(self, done: float, detail: str = "") -> None:
+    def at(self, done: float | int, detail: str = "") -> None:
         """So many units are done."""
         self._done = done
         self._on_progress(Progress(self._stage, done, self._total, self.seconds(), detail))

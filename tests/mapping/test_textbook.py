@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -35,7 +37,7 @@ def test_noise_and_outliers_still_register_every_photo(seed):
 
 def test_every_stage_is_recorded_and_refinement_never_hurts():
     _, result = run(SceneOptions(num_cameras=4, num_points=200, layout="arc", noise_px=1.0, outlier_share=0.2))
-    rows = [record.as_row() for record in result.records]
+    rows = [asdict(record.row()) for record in result.records]
     assert {row["stage"] for row in rows} == set(STAGES)
 
     def rms(stage: str) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drawn_figures import drawn, in_panel, pixels, positions, vertices, words
+from fieldstone.records.field import CurvePoint
 from fieldstone.report.chart_figures import (
     DIFFERENCE_GAIN,
     difference_image,
@@ -77,16 +78,17 @@ def test_track_lengths_are_counted():
 
 
 def test_training_curve_leaves_out_what_is_not_a_number():
+    nan = float("nan")
     curve = [
-        {"step": 0, "seconds": 0.5, "loss": -1.0},
-        {"step": 1, "seconds": 1.0, "loss": float("nan"), "psnr": 12.0},
-        {"step": 2, "seconds": 2.0, "loss": -2.0, "psnr": 13.5},
-        {"step": 3, "seconds": 3.0, "loss": None, "psnr": float("inf")},
+        CurvePoint(0, 0.5, -1.0, nan),
+        CurvePoint(1, 1.0, nan, 12.0),
+        CurvePoint(2, 2.0, -2.0, 13.5),
+        CurvePoint(3, 3.0, nan, float("inf")),
     ]
     figure = training_figure(curve)
     np.testing.assert_allclose(positions(figure, "loss-values", 0), [[0.5, -1.0], [2.0, -2.0]], atol=1e-3)
     np.testing.assert_allclose(positions(figure, "psnr-values", 1), [[1.0, 12.0], [2.0, 13.5]], atol=1e-3)
-    assert words(training_figure([{"seconds": 1.0}, {"loss": 3.0}]), "text").count("not recorded") == 2
+    assert words(training_figure([CurvePoint(0, 1.0, nan, nan)]), "text").count("not recorded") == 2
 
 
 def test_difference_is_black_where_views_agree_and_grows_with_the_error():

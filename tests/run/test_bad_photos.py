@@ -22,7 +22,8 @@ from fieldstone.io.models.colmap import read_colmap
 from fieldstone.run.matching.detection import sharpness
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import match_photos
-from fieldstone.run.reconstruct import ReconstructOptions, reconstruct
+from fieldstone.run.reconstruct import reconstruct
+from fieldstone.run.reconstruct_options import ReconstructOptions, Tuning
 from fieldstone.synthetic import materials
 from fieldstone.synthetic.construction import Builder
 from fieldstone.synthetic.light import Sky, look_at
@@ -119,13 +120,14 @@ def test_sharpness_falls_with_blur(photos):
     assert sharpness(np.full_like(grey, 7)) == 0.0
 
 
-def test_every_photo_left_out_gets_a_verdict_with_a_number(photos, tmp_path):
+def test_every_photo_left_out_gets_a_verdict_with_a_number(photos):
     rgb = np.asarray(Image.open(photos / "house_03.jpg"))
     Image.fromarray(np.asarray(cv2.GaussianBlur(rgb, (0, 0), 8.0), dtype=np.uint8)).save(photos / "house_03.jpg")
     Image.fromarray(np.full((240, 320, 3), 90, dtype=np.uint8)).save(photos / "wall.png")
     shutil.copy(photos / "house_01.jpg", photos / "copy.jpg")
-    record = reconstruct(photos, tmp_path / "out", ReconstructOptions(matching=OPTIONS))
-    verdicts = {photo["name"]: photo["verdict"] for photo in record["photos"] if not photo["registered"]}
+    options = ReconstructOptions(tuning=Tuning(sift=OPTIONS.sift), threads=2)
+    scene = reconstruct(photos, options)
+    verdicts = {photo.name: photo.verdict for photo in scene.record.photos if not photo.registered}
     assert set(verdicts) == {"house_03.jpg", "wall.png", "house_01.jpg"}
     assert re.search(r"\d+ features; \d+ % as sharp as the median photo", verdicts["house_03.jpg"])
     assert "0 features" in verdicts["wall.png"]

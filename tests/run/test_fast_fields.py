@@ -201,7 +201,8 @@ def test_a_budget_becomes_a_plan_on_every_device(ball_folder, tmp_path):
 
 
 def test_a_device_without_torch_says_what_to_install(ball_folder, tmp_path, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith(("fieldstone.field.nerf.", "fieldstone.field.grid_torch."))]:
+    torch_users = ("fieldstone.field.nerf.", "fieldstone.field.grid_torch.")
+    for name in [name for name in sys.modules if name.startswith(torch_users)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(InputError, match=r"fast field on cuda needs torch: pip install 'fieldstone\[torch\]'"):

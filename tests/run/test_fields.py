@@ -271,7 +271,8 @@ def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
 def test_without_torch_the_way_out_is_named(tmp_path, monkeypatch):
     source = write_blender_folder(tmp_path / "in")
     monkeypatch.setitem(sys.modules, "torch", None)
-    for name in [name for name in sys.modules if name.startswith(("fieldstone.field.nerf.", "fieldstone.field.grid_torch."))]:
+    torch_users = ("fieldstone.field.nerf.", "fieldstone.field.grid_torch.")
+    for name in [name for name in sys.modules if name.startswith(torch_users)]:
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(InputError, match=r"pip install 'fieldstone\[torch\]'"):
         train_run(source, tmp_path / "out", max_steps=1)

@@ -18,7 +18,7 @@ import fieldstone
 RUN = """
 import os, resource, signal, sys
 from pathlib import Path
-from fieldstone.run import reconstruct as module
+from fieldstone.run import scene as module
 from fieldstone.cli import main
 
 writes_left, largest_file, original = int(sys.argv[1]), int(sys.argv[2]), Path.replace

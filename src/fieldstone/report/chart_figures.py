@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from fieldstone.records.field import CurvePoint
 from fieldstone.report import raster, svg
 from fieldstone.report.panel import TITLE_RISE, Panel, axes, title, whole_ticks
 from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, label, luminance, mixed, rgb_of
@@ -142,15 +142,14 @@ def track_lengths_figure(observations: Observations, *, theme: Theme = LIGHT) ->
     return svg.page(560.0, 460.0, theme, parts)
 
 
-def training_figure(curve: Sequence[Mapping[str, Any]], *, theme: Theme = LIGHT) -> str:
-    """Loss and PSNR over the seconds of training; entries without a finite value are left out."""
+def training_figure(curve: Sequence[CurvePoint], *, theme: Theme = LIGHT) -> str:
+    """Loss and PSNR over the seconds of training; steps without a finite value are left out."""
     parts = []
-    for k, (key, words, color) in enumerate(
-        (("loss", "training loss", theme.second), ("psnr", "PSNR (dB)", theme.first))
+    losses, psnrs = [(p.seconds, p.loss) for p in curve], [(p.seconds, p.psnr) for p in curve]
+    for k, (key, words, color, series) in enumerate(
+        (("loss", "training loss", theme.second, losses), ("psnr", "PSNR (dB)", theme.first, psnrs))
     ):
-        rows = [
-            (row["seconds"], row[key]) for row in curve if _is_number(row.get(key)) and _is_number(row.get("seconds"))
-        ]
+        rows = [point for point in series if np.isfinite(point).all()]
         panel = Panel(68.0 + 560.0 * k, 40.0, 470.0, 244.0)
         if not rows:
             center = (panel.left + panel.width / 2, panel.top + panel.height / 2)
@@ -223,7 +222,3 @@ def difference_image(
     """|rendered - true|, mean over channels, times `DIFFERENCE_GAIN`, from black over red to white."""
     difference = np.abs(rendered.astype(np.int16) - true).mean(axis=2) / 255.0
     return raster.color_ramp(DIFFERENCE_GAIN * difference, cv2.COLORMAP_INFERNO)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

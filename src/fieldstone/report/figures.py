@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.records.field import CurvePoint, ViewScores
 from fieldstone.report import chart_figures, model_figures, photo_figures
 from fieldstone.report.figure_store import ReportFigure
 from fieldstone.report.raster import DRAWN_PX, small
@@ -123,17 +123,17 @@ def mapping_figures(
 
 
 def field_figures(
-    curve: Sequence[Mapping[str, Any]],
-    rendered: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
-    true: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
-    scores: Mapping[str, Mapping[str, Any]],
+    curve: Sequence[CurvePoint],
+    rendered: Callable[[str], UInt8[np.ndarray, "_ _ 3"]],
+    true: Callable[[str], UInt8[np.ndarray, "_ _ 3"]],
+    scores: Mapping[str, ViewScores],
     options: FigureOptions | None = None,
 ) -> Iterator[ReportFigure]:
     """The figures of a trained field: its curve, and rendered views beside the true ones, by name.
 
     Args:
-        curve: Entries with `seconds`, `loss` and sometimes `psnr`.
-        scores: For every rendered view its `psnr` and, if known, `ssim`; they choose which views are shown.
+        rendered, true: Pixels of a view by its label; asked for the views that are shown.
+        scores: Of every rendered view, by its label; they choose which views are shown.
     """
     options = options or FigureOptions()
     if curve:
@@ -145,10 +145,10 @@ def field_figures(
             "longer budget.",
             lambda theme: chart_figures.training_figure(curve, theme=theme),
         )
-    names = sorted(set(rendered) & set(true), key=lambda name: (scores.get(name, {}).get("psnr", 0.0), name))
+    names = sorted(scores, key=lambda name: (scores[name].psnr, name))
     chosen = [names[k] for k in evenly(len(names), options.max_views).tolist()]
     if chosen:
-        rows = [(name, true[name], rendered[name], _score(scores.get(name, {}))) for name in chosen]
+        rows = [(name, true(name), rendered(name), _score(scores[name])) for name in chosen]
         share = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} from the worst to the best"
         yield ReportFigure(
             "field",
@@ -295,10 +295,5 @@ def _model_figures(run: MappingRun) -> Iterator[ReportFigure]:
     )
 
 
-def _score(scores: Mapping[str, Any]) -> str:
-    parts = []
-    if "psnr" in scores:
-        parts.append(f"{scores['psnr']:.2f} dB")
-    if "ssim" in scores:
-        parts.append(f"SSIM {scores['ssim']:.3f}")
-    return ", ".join(parts)
+def _score(scores: ViewScores) -> str:
+    return f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"

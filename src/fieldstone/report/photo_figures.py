@@ -154,10 +154,10 @@ def reprojections_figure(
 
 
 def _stage_title(record: StageRecord) -> str:
-    row = record.as_row()
-    mean = "no point in front" if row["mean_px"] is None else f"mean {row['mean_px']:.2f} px"
-    unseen = f", {row['behind']} behind" if row["behind"] else ""
-    return f"{record.stage}: {mean}, {row['points']} points{unseen}"
+    row = record.row()
+    mean = "no point in front" if row.mean_px is None else f"mean {row.mean_px:.2f} px"
+    unseen = f", {row.behind} behind" if row.behind else ""
+    return f"{record.stage}: {mean}, {row.points} points{unseen}"
 
 
 def magnification(records: Sequence[StageRecord], width_px: int) -> int:

@@ -30,11 +30,14 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
+from fieldstone.records.field import FieldMetrics
+from fieldstone.records.files import from_json
 from fieldstone.render.views import render_view
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import field_figures
-from fieldstone.report.summary import write_report
+from fieldstone.report.page import Story
 from fieldstone.run.field_input import read_ray_dataset, view_labels
+from fieldstone.run.folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
@@ -175,7 +178,7 @@ def evaluate_views(
         share = 1.0 if image.keep is None else max(float(image.keep.mean()), 1e-9)
         # Equal pixels where the mask is black count nothing: the mean is over the others.
         found = psnr(as_written, photo) + 10.0 * np.log10(share)
-        views[label] = {"psnr": min(found, MAX_PSNR), "ssim": ssim(as_written, photo)}
+        views[label] = {"psnr": float(min(found, MAX_PSNR)), "ssim": float(ssim(as_written, photo))}
     sizes = sorted({(image.camera.width, image.camera.height) for image in dataset.test})
     background = ", ".join(f"{255 * c:.0f}" for c in dataset.frame.background)
     masked = any(image.keep is not None for image in dataset.test)
@@ -194,16 +197,17 @@ def evaluate_views(
 
 def write_field_report(out: Path, dataset: RayDataset, curve: Sequence[CurvePoint], metrics: Mapping[str, Any]) -> None:
     """Add the training curve and rendered beside true views to the report of the folder."""
-    labels = view_labels([image.name for image in dataset.test])
-    rendered = {label: read_photo(out / "renders" / "test" / f"{label}.png").rgb for label in labels}
-    background = dataset.frame.background
-    true = {
-        label: np.rint(255.0 * image.composited(background)).astype(np.uint8)
-        for label, image in zip(labels, dataset.test, strict=True)
-    }
-    figures = field_figures([asdict(point) for point in curve], rendered, true, metrics["views"])
-    write_figures(out / "figures", "field", figures)
-    write_report(out)
+    images = dict(zip(view_labels([image.name for image in dataset.test]), dataset.test, strict=True))
+    found = from_json(FieldMetrics, metrics, METRICS)
+    figures = field_figures(
+        curve,
+        lambda label: read_photo(out / "renders" / "test" / f"{label}.png").rgb,
+        lambda label: np.rint(255.0 * images[label].composited(dataset.frame.background)).astype(np.uint8),
+        found.views,
+    )
+    folder = RunFolder(out)
+    write_figures(folder.figures, "field", figures)
+    folder.write_report(Story(folder.read_run(), found, curve))
 
 
 def run_header(field: str, options: Mapping[str, Any], seed: int, dataset: RayDataset) -> dict[str, Any]:

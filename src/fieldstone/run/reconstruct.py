@@ -1,14 +1,11 @@
-"""Photos, or the course's match files, to camera poses, a point cloud and an honest error table."""
+"""Photos, or given matches, to camera poses, a point cloud and an honest error table."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,29 +14,24 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.features.verification import verify_pairs
 from fieldstone.io.course.matching_txt import is_course_folder
-from fieldstone.io.files.atomic import write_json
 from fieldstone.io.files.cache import Workspace
-from fieldstone.io.files.checkpoint import write_checkpoint
-from fieldstone.io.files.lock import sole_writer
-from fieldstone.io.models.colmap import write_colmap
-from fieldstone.io.shapes.ply import write_points
-from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.automatic import map_automatic
 from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity
 from fieldstone.mapping.incremental.checkpoint import GrowthMemory
-from fieldstone.mapping.textbook import TextbookOptions, map_textbook
-from fieldstone.report.figure_store import write_figures
-from fieldstone.report.figures import mapping_figures, shrunk, thumbnails
-from fieldstone.report.summary import write_report
+from fieldstone.mapping.textbook import map_textbook
+from fieldstone.progress import OnProgress, Progress, silent
+from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
+from fieldstone.report.figures import shrunk, thumbnails
+from fieldstone.run.folder import RunFolder
 from fieldstone.run.kept_growth import KeptGrowth
-from fieldstone.run.matching.options import MatchingOptions
-from fieldstone.run.matching.photos_to_graph import Material, OnStage, match_photos, read_course
+from fieldstone.run.matching.photos_to_graph import Material, match_photos, read_course
+from fieldstone.run.reconstruct_options import ReconstructOptions
+from fieldstone.run.scene import Scene, sizes_of, summary_of, write_scene
 from fieldstone.scene.mapping_run import MappingRun, StageRecord
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.scene.reconstruction import Reconstruction, View
+from fieldstone.scene.reconstruction import View
 
-Mapper = Literal["auto", "textbook", "incremental", "global"]
-UNITS = "units"
-"""Folder below `work/` for what is kept."""
+ChosenMapper = Literal["textbook", "incremental", "global"]
 
 HOW_ERRORS_ARE_COUNTED = (
     "Every error is the distance in pixels between an observed keypoint and the reprojection of its point, taken over "
@@ -50,126 +42,118 @@ HOW_ERRORS_ARE_COUNTED = (
 )
 
 
-@dataclass(frozen=True)
-class ReconstructOptions:
-    """How a folder becomes a model."""
-
-    mapper: Mapper = "auto"
-    """auto: incremental for photos, and for given matches of places that look alike; textbook for other given matches.
-
-    global places all photos at once.
-    """
-    matching: MatchingOptions = field(default_factory=MatchingOptions)
-    """Features, matches and two-view geometry of photos."""
-    textbook: TextbookOptions = field(default_factory=TextbookOptions)
-    incremental: AutomaticOptions = field(default_factory=AutomaticOptions)
-    seed: int = 0
-    """Every random number of the run follows from it."""
-    fresh: bool = False
-    """Use nothing that an earlier run has kept."""
-
-
 def reconstruct(
-    source: Path, out: Path, options: ReconstructOptions, *, on_stage: OnStage = lambda stage: None
-) -> dict[str, Any]:
-    """Reconstruct a folder of photos, or one in the course format, and write everything to `out`.
+    source: str | Path,
+    options: ReconstructOptions | None = None,
+    *,
+    keep_in: str | Path | None = None,
+    report: bool = True,
+    on_progress: OnProgress = silent,
+    **settings: Any,
+) -> Scene:
+    """Camera poses and a point cloud from a folder of photos, or from a data set with given matches.
 
-    Writes `sparse/0/` (COLMAP binary; further components in `sparse/1/` and so on), `points.ply`, `figures/`,
-    `run.json` and `report.html`. Features, matches, two-view geometry and the growing model are kept in `work/` as they
-    are found: a run that was stopped goes on from there when it is started again, and ends with the same bytes.
+    Args:
+        source: Folder with photos; or with `calibration.txt`, `matching*.txt` and the photos.
+        options: None: those that `settings` give.
+        keep_in: Folder for the result: `sparse/0` (COLMAP; further models in `sparse/1` and so on), `points.ply`,
+            `run.json`, `report.html`. Features, matches, two-view geometry and the growing model are kept in its `work`
+            as they are found: a run that was stopped goes on from there when it is started again, and ends with the
+            same bytes. None: nothing is written.
+        report: Whether to draw figures and page.
+        on_progress: Hears how far every stage is.
+        settings: Fields of `ReconstructOptions`, where no options are given.
 
     Returns:
-        What `run.json` holds.
+        The scene; without a model (`scene.summary.registered` is 0) if no photo could be registered.
 
     Raises:
-        InputError: The folder is no usable input, or another process writes to `out`.
+        InputError: The folder is no usable input, an option cannot be used, or another process writes to `keep_in`.
     """
-    with sole_writer(out) as work:
-        if options.fresh:
-            shutil.rmtree(work / UNITS, ignore_errors=True)
-        return _reconstruct(source, out, options, Workspace(work / UNITS), on_stage)
+    options = options or ReconstructOptions(**settings)
+    if keep_in is None:
+        return _reconstructed(Path(source), options, Workspace(), on_progress)
+    out = RunFolder(Path(keep_in))
+    with out.sole_writer(fresh=options.fresh) as cache:
+        return reconstruct_into(out, cache, Path(source), options, report=report, on_progress=on_progress)
 
 
-def _reconstruct(
-    source: Path, out: Path, options: ReconstructOptions, workspace: Workspace, on_stage: OnStage
-) -> dict[str, Any]:
-    course = is_course_folder(source)
-    if course:
-        material = read_course(source)
-    else:
-        material = match_photos(source, options.matching, options.seed, on_stage, workspace)
-    mapper = options.mapper if options.mapper != "auto" else "incremental"
-    if course and options.mapper != "textbook":
-        verified = replace(material, graph=_verified(material, options))
-        if options.mapper == "auto" and not _look_alike(verified):
-            mapper = "textbook"  # on the matches as given
-        else:
-            material = verified
-    on_stage("mapping")
-    start = time.perf_counter()
-    memory = KeptGrowth(workspace)
-    photo_of = shrunk(material.photo_of)
+def reconstruct_into(
+    out: RunFolder,
+    cache: Workspace,
+    source: Path,
+    options: ReconstructOptions,
+    *,
+    report: bool = True,
+    on_progress: OnProgress = silent,
+) -> Scene:
+    """`reconstruct` for who holds the folder already."""
     with ThreadPoolExecutor(1) as meanwhile:
-        small = meanwhile.submit(thumbnails, material.graph.names, photo_of)
-        run = full_size(run_mapper(mapper, material, options, memory), material)
-    seconds = {**material.seconds, "mapping": time.perf_counter() - start}
-    on_stage("writing")
+        small: list[Future[Mapping[str, np.ndarray]]] = []
+
+        def draw_thumbnails(photos: Material) -> None:
+            if report:
+                small.append(meanwhile.submit(thumbnails, photos.graph.names, shrunk(photos.photo_of)))
+
+        scene = _reconstructed(source, options, cache, on_progress, draw_thumbnails)
+    on_progress(Progress("writing"))
+    scene = write_scene(scene, out, report=report, small=small[0].result() if small else None)
+    KeptGrowth(cache).forget()
+    return scene
+
+
+def _reconstructed(
+    source: Path,
+    options: ReconstructOptions,
+    cache: Workspace,
+    on_progress: OnProgress,
+    on_matched: Callable[[Material], None] = lambda photos: None,
+) -> Scene:
+    """The stages, one after the other.
+
+    Args:
+        on_matched: Is called with the matched photos before they are mapped.
+    """
+    photos, mapper = _matched_photos(source, options, cache, on_progress)
+    on_matched(photos)
+    on_progress(Progress("mapping", 0, photos.graph.num_images))
     start = time.perf_counter()
-    write_models(run, out)
-    write_covariance(run, out)
-    write_figures(out / "figures", "mapping", mapping_figures(run, photo_of), small.result())
-    seconds["writing"] = time.perf_counter() - start
-    record = run_record(source, mapper, run, material, options.seed, seconds)
-    # Relative, so that the two folders may move together.
-    record["photos_folder"] = Path(os.path.relpath(source.resolve(), out.resolve())).as_posix()
-    if options.matching.masks is not None:
-        record["masks_folder"] = Path(os.path.relpath(options.matching.masks.resolve(), out.resolve())).as_posix()
-    write_json(out / "run.json", record)
-    write_report(out)
-    memory.forget()
-    return record
+    run = full_size(run_mapper(mapper, photos, options, KeptGrowth(cache)), photos)
+    seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
+    record = run_record(source, mapper, run, photos, options.seed, seconds)
+    return Scene(record, run, photos.photo_of, source, options.masks)
 
 
-def write_models(run: MappingRun, out: Path) -> None:
-    """`sparse/0`, `sparse/1`, ... and `points.ply`; the further models of an earlier run in this folder go."""
-    models = [model for model in (run.reconstruction, *run.others) if len(model.registered())]
-    for k, model in enumerate(models):
-        write_colmap(model, out / "sparse" / str(k))
-    for k in range(len(models), _components_of_earlier_run(out)):
-        shutil.rmtree(out / "sparse" / str(k), ignore_errors=True)
-    if len(run.reconstruction.points):
-        write_points(run.reconstruction.points, out / "points.ply")
-    elif (out / "run.json").exists():
-        (out / "points.ply").unlink(missing_ok=True)
+def _matched_photos(
+    source: Path, options: ReconstructOptions, cache: Workspace, on_progress: OnProgress
+) -> tuple[Material, ChosenMapper]:
+    """What a mapper works on, and the mapper that suits it.
 
-
-def write_covariance(run: MappingRun, out: Path) -> None:
-    """`covariance.safetensors`, if it was asked for: `views` (n, 6, 6), `points` (p, 3, 3)."""
-    path = out / "covariance.safetensors"
-    if run.uncertainty is None:
-        path.unlink(missing_ok=True)
-        return
-    facts = {"sigma_px": run.uncertainty.sigma_px, "photos": list(run.graph.names)}
-    write_checkpoint(path, {"views": run.uncertainty.of_views, "points": run.uncertainty.of_points}, facts)
-
-
-def _components_of_earlier_run(out: Path) -> int:
-    """How many models the run that wrote `run.json` left; 0 without a readable one."""
-    try:
-        return len(json.loads((out / "run.json").read_text(encoding="utf-8"))["components"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0
+    Photos are matched here; of given matches, the textbook mapper takes the pairs as they are, unless places look
+    alike: it knows of one place only.
+    """
+    matching = options.matching()
+    if not is_course_folder(source):
+        photos = match_photos(source, matching, options.seed, lambda stage: on_progress(Progress(stage)), cache)
+        return photos, "incremental" if options.mapper == "auto" else options.mapper
+    given = read_course(source)
+    if options.mapper == "textbook":
+        return given, "textbook"
+    verified = replace(given, graph=_verified(given, options))
+    if options.mapper == "auto":
+        return (verified, "incremental") if _look_alike(verified) else (given, "textbook")
+    return verified, options.mapper
 
 
 def run_mapper(
-    mapper: Mapper, material: Material, options: ReconstructOptions, memory: GrowthMemory | None = None
+    mapper: ChosenMapper, material: Material, options: ReconstructOptions, memory: GrowthMemory | None = None
 ) -> MappingRun:
     """One of the mappers on the same material."""
     graph, cameras, camera_of_image = material.graph, material.cameras, material.camera_of_image
     if mapper == "textbook":
-        textbook = replace(options.textbook, refine_focal=not material.known.all())
+        textbook = replace(options.tuning.textbook, refine_focal=not material.known.all())
         return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
-    automatic = replace(options.incremental.with_threads(options.matching.threads), mapper=mapper)
+    automatic = options.mapping(mapper)
     return map_automatic(
         graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look, memory
     )
@@ -183,7 +167,7 @@ def _look_alike(verified: Material) -> bool:
 
 def _verified(material: Material, options: ReconstructOptions) -> MatchGraph:
     """Given matches with the geometry of every pair."""
-    matching, cameras, camera_of_image = options.matching, material.cameras, material.camera_of_image
+    matching, cameras, camera_of_image = options.matching(), material.cameras, material.camera_of_image
     return verify_pairs(material.graph, cameras, camera_of_image, matching.two_view, options.seed, matching.threads)
 
 
@@ -210,74 +194,58 @@ def full_size(run: MappingRun, material: Material) -> MappingRun:
 
 
 def run_record(
-    source: Path, mapper: str, run: MappingRun, material: Material, seed: int, seconds: Mapping[str, float]
-) -> dict[str, Any]:
+    source: Path, mapper: str, run: MappingRun, photos: Material, seed: int, seconds: Mapping[str, float]
+) -> RunRecord:
     """What `run.json` tells of a run."""
     model = run.reconstruction
+    verdicts = (*_verdicts_on_views(run, photos), *_verdicts_on_problems(run, photos))
+    return RunRecord(
+        version=__version__,
+        input=source.resolve().name,
+        mapper=mapper,
+        seed=seed,
+        seconds={stage: round(value, 3) for stage, value in seconds.items()},
+        summary=summary_of(model, len(verdicts)),
+        components=sizes_of((model, *run.others)),
+        cameras=tuple(CameraRecord.of(camera) for camera in model.cameras),
+        notes=(*photos.notes, *run.notes),
+        photos=verdicts,
+        table=tuple(record.row() for record in run.records),
+        drops=tuple(DropRecord(drop.stage, drop.reason, drop.observations) for drop in run.drops),
+        how_errors_are_counted=HOW_ERRORS_ARE_COUNTED,
+    )
+
+
+def _verdicts_on_views(run: MappingRun, photos: Material) -> Iterator[PhotoVerdict]:
+    """Of every photo that was matched."""
+    model, uncertainty = run.reconstruction, run.uncertainty
     counts = np.bincount(model.observations.view, minlength=len(model.views))
-    photos = [
-        {
-            "name": view.name,
-            "registered": view.cam_from_world is not None,
-            "verdict": run.verdicts[view.name] + _sharpness(view, material),
-            "points": int(counts[k]),
-        }
-        for k, view in enumerate(model.views)
-    ]
-    if run.uncertainty is not None:
-        for k in model.registered():
-            photos[k]["sd_rotation_deg"] = float(run.uncertainty.rotation_deg[k])
-            photos[k]["sd_center"] = float(run.uncertainty.center[k])
-    photos += [
-        {
+    for k, view in enumerate(model.views):
+        registered = view.cam_from_world is not None
+        determined = uncertainty if registered else None
+        yield PhotoVerdict(
+            name=view.name,
+            registered=registered,
+            verdict=run.verdicts[view.name] + _sharpness(view, photos),
+            points=int(counts[k]),
+            sd_rotation_deg=None if determined is None else float(determined.rotation_deg[k]),
+            sd_center=None if determined is None else float(determined.center[k]),
+        )
+
+
+def _verdicts_on_problems(run: MappingRun, photos: Material) -> Iterator[PhotoVerdict]:
+    """Of every file that is no photo to work with."""
+    for problem in photos.problems:
+        if problem.path.name not in run.verdicts:
             # Not every file name is text.
-            "name": p.path.name.encode(errors="backslashreplace").decode(),
-            "registered": False,
-            "verdict": f"{p.kind}: {p.reason}",
-            "points": 0,
-        }
-        for p in material.problems
-        if p.path.name not in run.verdicts
-    ]
-    return {
-        "version": __version__,
-        "input": source.resolve().name,
-        "mapper": mapper,
-        "seed": seed,
-        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
-        "summary": summary(model, len(photos)),
-        "components": [len(m.registered()) for m in (model, *run.others)],
-        "cameras": [
-            {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in model.cameras
-        ],
-        "notes": [*material.notes, *run.notes],
-        "photos": photos,
-        "table": [record.as_row() for record in run.records],
-        "drops": [asdict(drop) for drop in run.drops],
-        "how_errors_are_counted": HOW_ERRORS_ARE_COUNTED,
-    }
+            name = problem.path.name.encode(errors="backslashreplace").decode()
+            yield PhotoVerdict(name, registered=False, verdict=f"{problem.kind}: {problem.reason}", points=0)
 
 
-def _sharpness(view: View, material: Material) -> str:
+def _sharpness(view: View, photos: Material) -> str:
     """For a photo that was not registered: how sharp it is, compared with the others."""
-    if view.cam_from_world is not None or view.name not in material.sharpness:
+    if view.cam_from_world is not None or view.name not in photos.sharpness:
         return ""
-    median = float(np.median(list(material.sharpness.values())))
-    own = material.sharpness[view.name]
+    median = float(np.median(list(photos.sharpness.values())))
+    own = photos.sharpness[view.name]
     return f"; {100 * own / median:.0f} % as sharp as the median photo" if median > 0.0 else "; no detail in any photo"
-
-
-def summary(model: Reconstruction, num_photos: int) -> dict[str, Any]:
-    """The numbers of a model that one looks at first."""
-    errors = model.reprojection_errors()
-    some = len(errors) > 0
-    return {
-        "registered": len(model.registered()),
-        "photos": num_photos,
-        "points": len(model.points),
-        "observations": len(model.observations),
-        "mean_px": float(errors.mean()) if some else None,
-        "median_px": float(np.median(errors)) if some else None,
-        "rms_px": float(np.sqrt(np.mean(errors**2))) if some else None,
-        "mean_track_length": len(errors) / len(model.points) if some else None,
-    }

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.records.mapping import ErrorRow
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -37,19 +38,19 @@ class StageRecord:
         distance = np.linalg.norm(self.reprojected - self.pixels, axis=1)
         return distance[np.isfinite(distance)]
 
-    def as_row(self) -> dict[str, str | int | float | None]:
+    def row(self) -> ErrorRow:
         """One row of the error table."""
         errors = self.errors()
         some = len(errors) > 0
-        return {
-            "stage": self.stage,
-            "photo": self.name,
-            "points": len(errors),
-            "behind": len(self.pixels) - len(errors),
-            "mean_px": float(errors.mean()) if some else None,
-            "median_px": float(np.median(errors)) if some else None,
-            "rms_px": float(np.sqrt(np.mean(errors**2))) if some else None,
-        }
+        return ErrorRow(
+            stage=self.stage,
+            photo=self.name,
+            points=len(errors),
+            behind=len(self.pixels) - len(errors),
+            mean_px=float(errors.mean()) if some else None,
+            median_px=float(np.median(errors)) if some else None,
+            rms_px=float(np.sqrt(np.mean(errors**2))) if some else None,
+        )
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from fieldstone.field.base.interrupts import deferred_interrupts
 from fieldstone.field.base.radiance_field import FieldTraining, StepReport
+from fieldstone.records.field import CurvePoint
 
 logger = logging.getLogger(__name__)
 
@@ -87,16 +88,6 @@ NERF = TrainOptions(
 """The original NeRF, `mildenhall2020`: its networks, samples, loss and learning rate; 256 rays a step, not 4096."""
 
 PRESETS = {"tiny": TINY, "nerf": NERF}
-
-
-@dataclass(frozen=True)
-class CurvePoint:
-    """One step of a training curve; psnr is that of the step's own batch of training rays, in dB."""
-
-    step: int
-    seconds: float
-    loss: float
-    psnr: float
 
 
 OnStep = Callable[[CurvePoint], None]

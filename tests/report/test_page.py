@@ -8,6 +8,7 @@ import io
 import json
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -17,9 +18,13 @@ from PIL import Image
 
 from fieldstone.errors import InputError
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
+from fieldstone.records.field import CurvePoint, FieldMetrics, ViewScores
+from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord, TruthErrors
 from fieldstone.report.figure_store import read_index, write_figures
 from fieldstone.report.figures import FigureOptions, field_figures, mapping_figures, pairs_to_show, thumbnails
-from fieldstone.report.summary import write_report
+from fieldstone.report.page import Story
+from fieldstone.run.folder import RunFolder
+from fieldstone.run.scene import summary_of
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 
 NASTY = (
@@ -108,38 +113,41 @@ def mapped():
     return map_textbook(graph, scene.truth.cameras, camera_of_image, TextbookOptions(), 0)
 
 
-def run_json(run) -> dict:
-    model = run.reconstruction
-    errors = model.reprojection_errors()
-    return {
-        "input": "/home/someone/private/<i>hall</i>",
-        "mapper": "textbook",
-        "seed": 7,
-        "seconds": {"read_photos": 1.25, "map": 62.0},
-        "photos": [
-            {"name": n, "registered": v.startswith("registered"), "verdict": v, "points": 10}
-            for n, v in run.verdicts.items()
-        ]
-        + [{"name": NASTY[5], "registered": False, "verdict": "not registered: sees 3 points", "points": 0}],
-        "table": [record.as_row() for record in run.records],
-        "drops": [{"stage": d.stage, "reason": d.reason, "observations": d.observations} for d in run.drops],
-        "summary": {
-            "registered": len(model.registered()),
-            "photos": 5,
-            "points": len(model.points),
-            "observations": len(errors),
-            "mean_px": float(errors.mean()),
-            "median_px": float(np.median(errors)),
-            "rms_px": float(np.sqrt(np.mean(errors**2))),
-            "mean_track_length": 2.5,
-        },
-        "how_errors_are_counted": "mean distance & <b>nothing</b> else",
-        "version": "0.1.0",
-        "notes": ["focal <length> from EXIF of 3 photos"],
-        "components": [4, 2],
-        "cameras": [{"model": "PINHOLE", "width": 1000, "height": 750, "params": [800.0, 810.5, 505.0, 370.0]}],
-        "truth": {"pose_error_deg_max": 0.0123, "position_error": 0.004},
-    }
+def run_record(run) -> RunRecord:
+    verdicts = [PhotoVerdict(n, v.startswith("registered"), v, 10) for n, v in run.verdicts.items()]
+    return RunRecord(
+        version="0.1.0",
+        input="<i>hall</i>",
+        mapper="textbook",
+        seed=7,
+        seconds={"read_photos": 1.25, "map": 62.0},
+        summary=summary_of(run.reconstruction, 5),
+        components=(4, 2),
+        cameras=(CameraRecord("PINHOLE", 1000, 750, (800.0, 810.5, 505.0, 370.0)),),
+        notes=("focal <length> from EXIF of 3 photos",),
+        photos=(*verdicts, PhotoVerdict(NASTY[5], False, "not registered: sees 3 points", 0)),
+        table=tuple(record.row() for record in run.records),
+        drops=tuple(DropRecord(d.stage, d.reason, d.observations) for d in run.drops),
+        how_errors_are_counted="mean distance & <b>nothing</b> else",
+        photos_folder="/home/someone/private",
+        truth=TruthErrors(4, 0.0123, 0.02, 0.004, 0.005, 0.1),
+    )
+
+
+METRICS = FieldMetrics(
+    psnr=21.5,
+    ssim=0.75,
+    views={NASTY[4]: ViewScores(21.5, 0.75)},
+    protocol="8 <bit>",
+    seconds=30.0,
+    steps=4,
+    field="fast",
+    device="cpu",
+    threads=1,
+    seed=7,
+    version="0.1.0",
+)
+CURVE = [CurvePoint(k, float(k), -float(k), 10.0 + k) for k in range(4)]
 
 
 def photo_of(name: str):
@@ -156,16 +164,17 @@ def folder(mapped, tmp_path_factory) -> Path:
     write_figures(
         out / "figures", "mapping", mapping_figures(mapped, photo_of, OPTIONS), thumbnails(NASTY[:4], photo_of)
     )
-    view = photo_of("x")
-    scores = {NASTY[4]: {"psnr": 21.5, "ssim": 0.75}}
-    curve = [{"step": k, "seconds": float(k), "loss": -float(k), "psnr": 10.0 + k} for k in range(4)]
-    write_figures(out / "figures", "field", field_figures(curve, {NASTY[4]: view}, {NASTY[4]: view}, scores))
-    (out / "run.json").write_text(json.dumps(run_json(mapped)))
-    metrics = {"psnr": 21.5, "ssim": 0.75, "views": scores, "seconds": 30, "protocol": "8 <bit>"}
-    (out / "metrics.json").write_text(json.dumps(metrics))
-    (out / "curve.json").write_text(json.dumps(curve))
-    write_report(out)
+    run = RunFolder(out)
+    write_figures(run.figures, "field", field_figures(CURVE, photo_of, photo_of, METRICS.views))
+    run.write_run(run_record(mapped))
+    run.write_metrics(METRICS)
+    run.write_curve(CURVE)
+    run.write_report(Story(run_record(mapped), METRICS, CURVE))
     return out
+
+
+def write_report(folder: Path) -> None:
+    RunFolder(folder).write_report(RunFolder(folder).read_story())
 
 
 def page_of(folder: Path) -> str:
@@ -183,9 +192,9 @@ def test_page_holds_every_row_of_the_tables(folder, mapped):
     rows = Page(page_of(folder)).rows
     assert len(mapped.records) > 10
     for record in mapped.records:
-        row = record.as_row()
-        shown = [row["stage"], row["photo"], f"{row['points']:,}", f"{row['behind']:,}"]
-        shown += ["–" if row[key] is None else f"{row[key]:,.3f}" for key in ("mean_px", "median_px", "rms_px")]
+        row = record.row()
+        shown = [row.stage, row.photo, f"{row.points:,}", f"{row.behind:,}"]
+        shown += ["–" if px is None else f"{px:,.3f}" for px in (row.mean_px, row.median_px, row.rms_px)]
         assert any(r[:7] == shown for r in rows), shown
     for drop in mapped.drops:
         assert [drop.stage, drop.reason, f"{drop.observations:,}"] in rows
@@ -277,26 +286,12 @@ def test_missing_parts_leave_their_part_out(folder, tmp_path, missing):
 
 
 @pytest.mark.parametrize(
-    "run",
-    [
-        {"summary": {"registered": None, "points": "many", "mean_px": None}, "photos": [{}, 3, None], "table": [{}]},
-        {"table": "none", "drops": {"a": 1}, "photos": 4, "seconds": [1], "summary": [], "truth": 3, "notes": 5},
-        {"table": [{"stage": 1, "photo": None, "points": True, "mean_px": "x"}], "seconds": {"total": 3, "map": None}},
-        {"table": [{"stage": "a", "mean_px": 0.0, "points": 0, "photo": "b"}], "seed": None, "cameras": [1, {}]},
-    ],
-)
-def test_odd_values_show_as_dashes(tmp_path, run):
-    (tmp_path / "run.json").write_text(json.dumps(run))
-    write_report(tmp_path)
-    assert_inert(page_of(tmp_path))
-
-
-@pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("run.json", '{"a": 1,\n "b": }', "line 2"),
-        ("run.json", "[1]", "expected an object"),
-        ("curve.json", "{}", "expected a list"),
+        ("run.json", '{"a": 1,\n "b": }', "cannot be read"),
+        ("run.json", "[1]", "not what this version writes"),
+        ("run.json", '{"version": 3}', r"\$\.version"),
+        ("curve.json", "{}", "not what this version writes"),
         ("metrics.json", b"\xff\xfe\x00", "cannot be read"),
         ("figures/index.json", '{"format": 99}', "format 99"),
         ("figures/index.json", '{"format": 1, "figures": [{"section": "x"}], "thumbnails": {}}', "not an index"),
@@ -316,7 +311,7 @@ def test_damaged_files_are_named_and_nothing_is_written(tmp_path, name, content,
 
 
 @pytest.mark.parametrize("kind", ["link", "missing"])
-def test_an_image_that_is_a_link_out_of_the_folder_or_missing_is_an_input_error(tmp_path, kind):
+def test_an_image_that_is_a_link_out_of_the_folder_or_missing_is_an_input_error(mapped, tmp_path, kind):
     (tmp_path / "figures").mkdir()
     secret = tmp_path / "secret"
     secret.write_text("key")
@@ -324,9 +319,9 @@ def test_an_image_that_is_a_link_out_of_the_folder_or_missing_is_an_input_error(
         (tmp_path / "figures" / "a.svg").symlink_to(secret)
     content = {"format": 1, "figures": [], "thumbnails": {"x": "a.svg"}}
     (tmp_path / "figures" / "index.json").write_text(json.dumps(content))
-    (tmp_path / "run.json").write_text(json.dumps({"photos": [{"name": "x"}]}))
+    record = replace(run_record(mapped), photos=(PhotoVerdict("x", False, "", 0),))
     with pytest.raises(InputError, match=r"a\.svg"):
-        write_report(tmp_path)
+        RunFolder(tmp_path).write_report(Story(record))
 
 
 def test_missing_folder_is_an_input_error(tmp_path):
@@ -360,9 +355,7 @@ def test_a_run_without_any_registered_photo_has_a_report(mapped, tmp_path):
     run = map_textbook(graph, cameras, np.zeros(4, dtype=np.int64), TextbookOptions(), 0)
     assert not len(run.reconstruction.registered())
     write_figures(tmp_path / "figures", "mapping", mapping_figures(run, lambda name: None))
-    (tmp_path / "run.json").write_text(
-        json.dumps({"photos": [{"name": n, "verdict": v} for n, v in run.verdicts.items()]})
-    )
+    RunFolder(tmp_path).write_run(run_record(run))
     write_report(tmp_path)
     assert "not registered" in "".join(assert_inert(page_of(tmp_path)).text)
 

@@ -1,0 +1,5 @@
+"""`python -m fieldstone.cli`: the console script."""
+
+from fieldstone.cli import run
+
+run()

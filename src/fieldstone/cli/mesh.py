@@ -1,0 +1,5 @@
+"""`fieldstone mesh`."""
+
+from fieldstone.cli.field_verbs import mesh
+
+__all__ = ["mesh"]

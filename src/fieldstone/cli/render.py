@@ -1,0 +1,5 @@
+"""`fieldstone render`."""
+
+from fieldstone.cli.field_verbs import render
+
+__all__ = ["render"]

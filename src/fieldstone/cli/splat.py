@@ -1,0 +1,5 @@
+"""`fieldstone splat`."""
+
+from fieldstone.cli.field_verbs import splat
+
+__all__ = ["splat"]

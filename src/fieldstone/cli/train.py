@@ -1,0 +1,5 @@
+"""`fieldstone train`."""
+
+from fieldstone.cli.field_verbs import train
+
+__all__ = ["train"]

@@ -1,0 +1,120 @@
+"""`run.json`: how photos became a model, told by numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fieldstone.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """A camera: its model, its size in pixels and its parameters, in the order of the model."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @staticmethod
+    def of(camera: Camera) -> CameraRecord:
+        """What is written of a camera."""
+        return CameraRecord(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
+
+    def camera(self) -> Camera:
+        """The camera."""
+        return Camera(self.model, self.width, self.height, np.array(self.params))
+
+
+@dataclass(frozen=True)
+class PhotoVerdict:
+    """One photo: whether it found its place, and the number that decided it."""
+
+    name: str
+    registered: bool
+    verdict: str
+    points: int
+    sd_rotation_deg: float | None = None
+    """Standard deviation of its rotation, where covariances were asked for."""
+    sd_center: float | None = None
+    """And of its position, in units of the model."""
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """Reprojection errors of one photo at one stage; None where no point has one."""
+
+    stage: str
+    photo: str
+    points: int
+    behind: int
+    """Points behind the camera, which have no error."""
+    mean_px: float | None
+    median_px: float | None
+    rms_px: float | None
+
+
+@dataclass(frozen=True)
+class DropRecord:
+    """Observations taken out of the model at one stage, and why."""
+
+    stage: str
+    reason: str
+    observations: int
+
+
+@dataclass(frozen=True)
+class ModelSummary:
+    """The numbers of a model that one looks at first; None where nothing is observed."""
+
+    registered: int
+    photos: int
+    points: int
+    observations: int
+    mean_px: float | None
+    median_px: float | None
+    rms_px: float | None
+    mean_track_length: float | None
+
+
+@dataclass(frozen=True)
+class TruthErrors:
+    """Errors against a known truth, after the similarity that brings the model into its frame (metres)."""
+
+    photos: int
+    rotation_error_mean_deg: float
+    rotation_error_max_deg: float
+    position_error_mean_m: float
+    position_error_max_m: float
+    focal_error_percent: float
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """All that `run.json` tells of a reconstruction."""
+
+    version: str
+    input: str
+    """Name of the folder that it was made from."""
+    mapper: str
+    seed: int
+    seconds: Mapping[str, float]
+    """Of every stage, in order."""
+    summary: ModelSummary
+    components: tuple[int, ...]
+    """Registered photos of every model, the largest first."""
+    cameras: tuple[CameraRecord, ...]
+    notes: tuple[str, ...]
+    """Decisions that a user should know of."""
+    photos: tuple[PhotoVerdict, ...]
+    table: tuple[ErrorRow, ...]
+    drops: tuple[DropRecord, ...]
+    how_errors_are_counted: str
+    photos_folder: str | None = None
+    """Where the photos lie, relative to the folder of the run, so that the two may move together."""
+    masks_folder: str | None = None
+    truth: TruthErrors | None = field(default=None)
+    """Where the photos are made, and the truth is known."""
