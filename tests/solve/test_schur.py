@@ -1,4 +1,3 @@
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -7,21 +6,14 @@ import pytest
 from bundle_worlds import mixed_problem, perturbed, without_refinement
 from fieldstone.geometry import rotation
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.solve.bundle.buffers import Values, allocate_linearization, start_values
 from fieldstone.solve.bundle.layout import lay_out
 from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals, updated
 from fieldstone.solve.bundle.schur import damped_step, normal_equations, reduced_camera_system
-from fieldstone.solve.bundle.schur_solver import (
-    Values,
-    Workers,
-    allocate,
-    allocate_linearization,
-    camera_system,
-    linearize,
-    move,
-    start_values,
-    tile_pattern,
-)
+from fieldstone.solve.bundle.schur_solver import camera_system, linearize, move, schur_solver
 from fieldstone.solve.bundle.schur_step import solve_step
+from fieldstone.solve.bundle.tile_pattern import tile_pattern
+from fieldstone.solve.bundle.workers import started_workers
 from fieldstone.solve.robust.loss import cauchy, huber, trivial
 
 PIVOT = np.array([0.3, -0.2, 0.5])
@@ -47,20 +39,20 @@ def compiled_step(
     tolerance: float = 1e-13,
     threads: int = 1,
 ) -> tuple[Values, float, float]:
-    layout = lay_out(problem, np.ones(len(problem.view), dtype=bool))
-    values = start_values(problem, layout)
-    pool = ThreadPoolExecutor(threads) if threads > 1 else None
-    workers, pattern = Workers(pool, threads), tile_pattern(layout, None if direct else -1.0)
+    layout = lay_out(problem, np.ones(len(problem.view), dtype=bool))._replace(pivot=PIVOT)
+    values, at = start_values(problem, layout), allocate_linearization(layout)
+    pattern = tile_pattern(layout, None if direct else -1.0)
     assert pattern.direct == direct
-    work, at = allocate(layout, pattern), allocate_linearization(layout)
-    cost = linearize(layout, values, loss, at, workers)
-    system = camera_system(layout, values, PIVOT, at, work, workers)
-    step = solve_step(layout, pattern, values, PIVOT, at, system, damping, work, workers, pcg_tolerance=tolerance)
-    assert step is not None
-    moved, promised = move(layout, values, PIVOT, at, step, damping, work, workers)
+    with started_workers(threads) as workers:
+        solver = schur_solver(layout, pattern, loss, workers)
+        cost = linearize(solver, values, at)
+        system = camera_system(solver, values, at)
+        step = solve_step(solver, values, at, system, damping, pcg_tolerance=tolerance)
+        assert step is not None
+        moved, promised = move(solver, values, at, step, damping)
     points = np.empty_like(moved.points)
     points[layout.point_order] = moved.points
-    return replace(moved, points=points), cost, promised
+    return moved._replace(points=points), cost, promised
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

@@ -27,25 +27,28 @@ def counting_order_numba(keys, num_keys):  # (n,) -> (n,), (num_keys + 1,)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def border_entries_numba(point_start, camera, border_of_camera):
-    """Distinct border cameras of every point: entry of each observation (-1: none), entry starts, entry cameras."""
+def coupled_cameras_numba(point_start, camera, shared_row):
+    """Distinct cameras with shared intrinsics that see each point.
+
+    Returns the coupling of each observation (-1: none), the start of each point's couplings, and their cameras.
+    """
     num_points = len(point_start) - 1
-    entry_of_obs = np.full(len(camera), -1, dtype=np.int64)
-    entry_start = np.zeros(num_points + 1, dtype=np.int64)
-    entry_camera = np.empty(len(camera), dtype=np.int64)
+    coupling_of_obs = np.full(len(camera), -1, dtype=np.int64)
+    coupling_start = np.zeros(num_points + 1, dtype=np.int64)
+    coupling_camera = np.empty(len(camera), dtype=np.int64)
     count = 0
     for p in range(num_points):
-        entry_start[p] = count
+        coupling_start[p] = count
         for o in range(point_start[p], point_start[p + 1]):
             c = camera[o]
-            if border_of_camera[c] < 0:
+            if shared_row[c] < 0:
                 continue
-            e = entry_start[p]
-            while e < count and entry_camera[e] != c:
+            e = coupling_start[p]
+            while e < count and coupling_camera[e] != c:
                 e += 1
             if e == count:
-                entry_camera[e] = c
+                coupling_camera[e] = c
                 count += 1
-            entry_of_obs[o] = e
-    entry_start[num_points] = count
-    return entry_of_obs, entry_start, entry_camera[:count].copy()
+            coupling_of_obs[o] = e
+    coupling_start[num_points] = count
+    return coupling_of_obs, coupling_start, coupling_camera[:count].copy()

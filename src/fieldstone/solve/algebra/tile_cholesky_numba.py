@@ -77,16 +77,16 @@ def subtract_numba(A, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _update_tile_numba(blocks, tile_index, L, row_tile, col_tile, num_slots, product, out):
+def _update_tile_numba(blocks, tile_index, L, row_tile, col_tile, num_blocks, product, out):
     """out (T, T) = A - sum_k L_row,k L_col,k^T, with the tile A gathered from its blocks.
 
-    Beyond the last slot the matrix is the identity.
+    Beyond the last block the matrix is the identity.
     """
     per_tile, block = blocks.shape[1], blocks.shape[3]
     tile = tile_index[row_tile, col_tile]
     given = tile < blocks.shape[0]
     for i in range(per_tile):
-        inside = row_tile * per_tile + i < num_slots
+        inside = row_tile * per_tile + i < num_blocks
         for j in range(per_tile):
             for a in range(block):
                 for b in range(block):
@@ -102,11 +102,11 @@ def _update_tile_numba(blocks, tile_index, L, row_tile, col_tile, num_slots, pro
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def factor_diagonal_numba(col_tile, blocks, tile_index, L, L_inv, num_slots):
+def factor_diagonal_numba(col_tile, blocks, tile_index, L, L_inv, num_blocks):
     """L_JJ and its inverse L_inv[col_tile]; False if the matrix is not positive definite."""
     out = L[tile_index[col_tile, col_tile]]
     product = np.empty(out.shape)
-    _update_tile_numba(blocks, tile_index, L, col_tile, col_tile, num_slots, product, out)
+    _update_tile_numba(blocks, tile_index, L, col_tile, col_tile, num_blocks, product, out)
     if not cholesky_in_place_numba(out):
         return False
     invert_lower_numba(out, L_inv[col_tile])
@@ -115,7 +115,7 @@ def factor_diagonal_numba(col_tile, blocks, tile_index, L, L_inv, num_slots):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def factor_column_numba(col_tile, start, step, blocks, tile_index, L, L_inv, num_slots, wide):
+def factor_column_numba(col_tile, start, step, blocks, tile_index, L, L_inv, num_blocks, wide):
     """Tiles of column col_tile below the diagonal, every `step`-th from `start`.
 
     `wide` (tiles, rows, T) holds more rows below all tiles, which are brought up to this column as well.
@@ -126,7 +126,7 @@ def factor_column_numba(col_tile, start, step, blocks, tile_index, L, L_inv, num
     num_tiles = tile_index.shape[0]
     for row_tile in range(col_tile + 1 + start, num_tiles, step):
         if tile_index[row_tile, col_tile] >= 0:
-            _update_tile_numba(blocks, tile_index, L, row_tile, col_tile, num_slots, product, out)
+            _update_tile_numba(blocks, tile_index, L, row_tile, col_tile, num_blocks, product, out)
             np.dot(out, L_inv[col_tile].T, L[tile_index[row_tile, col_tile]])
     for first in range(start * MAX_ROWS, wide.shape[1], step * MAX_ROWS):
         last = min(first + MAX_ROWS, wide.shape[1])
@@ -147,12 +147,12 @@ def factor_column_numba(col_tile, start, step, blocks, tile_index, L, L_inv, num
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def factor_numba(blocks, tile_index, L, L_inv, num_slots, wide):
+def factor_numba(blocks, tile_index, L, L_inv, num_blocks, wide):
     """All columns in one thread; False if the matrix is not positive definite."""
     for col_tile in range(tile_index.shape[0]):
-        if not factor_diagonal_numba(col_tile, blocks, tile_index, L, L_inv, num_slots):
+        if not factor_diagonal_numba(col_tile, blocks, tile_index, L, L_inv, num_blocks):
             return False
-        factor_column_numba(col_tile, 0, 1, blocks, tile_index, L, L_inv, num_slots, wide)
+        factor_column_numba(col_tile, 0, 1, blocks, tile_index, L, L_inv, num_blocks, wide)
     return True
 
 

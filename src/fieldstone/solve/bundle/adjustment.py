@@ -1,20 +1,26 @@
 """Bundle adjustment: Levenberg-Marquardt on poses, points and intrinsics through the Schur complement, compiled.
 
-`bundle_scipy.py` solves the same problem in a page, slowly; `schur.py` is the readable reference of one step.
+`scipy_reference.py` solves the same problem in a page, slowly; `schur.py` is the readable reference of one step.
 """
 
 from __future__ import annotations
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
+from fieldstone.solve.bundle.buffers import (
+    CameraSystem,
+    Linearization,
+    Values,
+    allocate_linearization,
+    start_values,
+)
 from fieldstone.solve.bundle.camera_prior import (
     CameraPrior,
     PriorRows,
@@ -26,29 +32,24 @@ from fieldstone.solve.bundle.camera_prior import (
     prior_rows,
 )
 from fieldstone.solve.bundle.layout import BundleLayout, lay_out
-from fieldstone.solve.bundle.linearize_numba import linearize_points_numba
 from fieldstone.solve.bundle.problem import BundleProblem
 from fieldstone.solve.bundle.schur_solver import (
-    CameraSystem,
-    Linearization,
-    Values,
-    Workers,
-    Workspace,
-    allocate,
-    allocate_linearization,
+    SchurSolver,
     camera_system,
     linearize,
+    linearize_point,
     move,
-    start_values,
-    tile_pattern,
+    schur_solver,
 )
 from fieldstone.solve.bundle.schur_step import solve_step
+from fieldstone.solve.bundle.tile_pattern import tile_pattern
+from fieldstone.solve.bundle.workers import started_workers
 
 logger = logging.getLogger(__name__)
 
 LossName = Literal["trivial", "huber", "soft_l1", "cauchy"]
 LOSS_NUMBERS: dict[str, int] = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3}
-"""How the kernels know the losses of `robust_loss`."""
+"""How the kernels know the losses of `robust.loss`."""
 
 MIN_DAMPING = 1e-10
 """Keeps the seven free directions of the gauge, and points seen once, away from rounding errors."""
@@ -56,7 +57,7 @@ MAX_DAMPING = 1e16
 NEGLIGIBLE_COST = 1e-18
 """Cost per observation, in squared pixels, that is nothing but rounding."""
 MIN_GAIN = 1e-3
-"""A step is taken when the cost falls by at least this share of what the linear model promised."""
+"""A step is taken when the cost falls by at least this fraction of what the linear model promised."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class BundleOptions:
     max_iterations: int = 100
     """Steps tried at most, accepted or not."""
     relative_tolerance: float = 1e-6
-    """Stop when a step lowers the cost by less than this share of it."""
+    """Stop when a step lowers the cost by less than this fraction of it."""
     initial_damping: float = 1e-4
     """Levenberg-Marquardt factor on the diagonal of the normal equations at the start."""
     keep_gauge: bool = False
@@ -90,6 +91,11 @@ class BundleOptions:
         if self.max_iterations < 0 or self.threads < 1 or not self.initial_damping > 0:
             raise ValueError("max_iterations must not be negative, threads at least 1, initial_damping positive")
 
+    @property
+    def kernel_loss(self) -> tuple[int, float]:
+        """Number of the loss and its squared scale, as the kernels take them."""
+        return LOSS_NUMBERS[self.loss], self.loss_scale_px**2
+
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
@@ -108,17 +114,6 @@ class BundleResult:
     """Cost at the start and after every accepted step."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Solver:
-    """Everything that stays the same during one adjustment."""
-
-    layout: BundleLayout
-    pivot: Float[np.ndarray, "3"]
-    loss: tuple[int, float]
-    priors: PriorRows
-    workers: Workers
-
-
 def bundle_adjust(problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
     """Minimise the robust reprojection error over all free poses, points and intrinsics.
 
@@ -135,49 +130,37 @@ def bundle_adjust(problem: BundleProblem, options: BundleOptions | None = None) 
     options = options or BundleOptions()
     usable = in_front(problem)
     layout = lay_out(problem, usable)
-    start = start_values(problem, layout)
-    if layout.num_columns + layout.num_border == 0 and not np.any(layout.free_point[layout.point]):
+    if layout.num_columns + layout.num_shared == 0 and not np.any(layout.free_point[layout.point_of_obs]):
         return BundleResult(problem, 0.0, 0.0, 0, "nothing to refine", usable)
-    pool = ThreadPoolExecutor(options.threads) if options.threads > 1 else None
-    try:
-        solver = _Solver(
-            layout,
-            np.median(start.points[layout.point_start[1:] > layout.point_start[:-1]], axis=0),
-            (LOSS_NUMBERS[options.loss], options.loss_scale_px**2),
-            prior_rows(problem, layout, options.camera_priors),
-            Workers(pool, options.threads),
-        )
-        values, costs, iterations, reason = _levenberg_marquardt(solver, start, options)
-    finally:
-        if pool is not None:
-            pool.shutdown()
+    priors = prior_rows(problem, layout, options.camera_priors)
+    with started_workers(options.threads) as workers:
+        solver = schur_solver(layout, tile_pattern(layout), options.kernel_loss, workers)
+        values, costs, iterations, reason = _levenberg_marquardt(solver, priors, start_values(problem, layout), options)
     logger.info("bundle adjustment: cost %.6g to %.6g in %d steps, %s", costs[0], costs[-1], iterations, reason)
     adjusted = _with_values(problem, layout, values)
     if options.keep_gauge and not (np.any(problem.fixed_views) or np.any(problem.fixed_points)):
-        adjusted = _restore_gauge(adjusted, problem, int(layout.listed_view.min()))
+        adjusted = _restore_gauge(adjusted, problem, int(layout.view_order.min()))
     return BundleResult(adjusted, costs[0], costs[-1], iterations, reason, usable, tuple(costs))
 
 
 def _levenberg_marquardt(
-    solver: _Solver, values: Values, options: BundleOptions
+    solver: SchurSolver, priors: PriorRows, values: Values, options: BundleOptions
 ) -> tuple[Values, list[float], int, str]:
     """Values at the minimum, the cost after every accepted step, the number of steps tried, the reason to stop."""
-    layout, workers = solver.layout, solver.workers
-    pattern = tile_pattern(layout)
-    work = allocate(layout, pattern)
+    layout = solver.layout
     at, trial = allocate_linearization(layout), allocate_linearization(layout)
-    costs = [linearize(layout, values, solver.loss, at, workers) + solver.priors.cost(values.params)]
-    system = _camera_system(solver, values, at, work)
+    costs = [linearize(solver, values, at) + priors.cost(values.params)]
+    system = _camera_system(solver, priors, values, at)
     damping, growth = max(options.initial_damping, MIN_DAMPING), 2.0
     for iteration in range(options.max_iterations):
-        step = solve_step(layout, pattern, values, solver.pivot, at, system, damping, work, workers)
+        step = solve_step(solver, values, at, system, damping)
         gain = -np.inf
         if step is not None:
-            moved, promised = move(layout, values, solver.pivot, at, step, damping, work, workers)
-            cost = _evaluate(solver, values, moved, trial)
+            moved, promised = move(solver, values, at, step, damping)
+            cost = _evaluate(solver, priors, values, moved, trial)
             gain = (costs[-1] - cost) / promised if promised > 0 else -np.inf
             logger.debug("step %d: cost %.9g, gain %.3f, damping %.2e", iteration, cost, gain, damping)
-            smallest = max(options.relative_tolerance * costs[-1], NEGLIGIBLE_COST * len(layout.view))
+            smallest = max(options.relative_tolerance * costs[-1], NEGLIGIBLE_COST * len(layout.view_of_obs))
             settled = max(promised, abs(costs[-1] - cost)) <= smallest
             if gain > MIN_GAIN:
                 settled = costs[-1] - cost <= smallest
@@ -188,7 +171,7 @@ def _levenberg_marquardt(
         if gain > MIN_GAIN:
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), MIN_DAMPING)
             growth = 2.0
-            system = _camera_system(solver, values, at, work)
+            system = _camera_system(solver, priors, values, at)
         else:
             damping, growth = damping * growth, growth * 2.0
             if damping > MAX_DAMPING:
@@ -196,44 +179,38 @@ def _levenberg_marquardt(
     return values, costs, options.max_iterations, "iteration limit"
 
 
-def _camera_system(solver: _Solver, values: Values, at: Linearization, work: Workspace) -> CameraSystem:
-    """Normal equations of poses and cameras with priors; parameters that push against a bound are held."""
-    system = camera_system(solver.layout, values, solver.pivot, at, work, solver.workers)
-    if not len(solver.priors.camera):
+def _camera_system(solver: SchurSolver, priors: PriorRows, values: Values, at: Linearization) -> CameraSystem:
+    """Normal equations of poses and intrinsics with priors; parameters that push against a bound are held."""
+    system = camera_system(solver, values, at)
+    if not len(priors.camera):
         return system
-    add_priors(solver.priors, values.params, system)
-    held = held_at_bounds(solver.priors, values.params, system)
+    add_priors(priors, values.params, system)
+    held = held_at_bounds(priors, values.params, system)
     if np.any(held):
-        drop_columns(solver.priors, held, solver.layout, at)
-        system = camera_system(solver.layout, values, solver.pivot, at, work, solver.workers)
-        add_priors(solver.priors, values.params, system)
-        pin(solver.priors, held, system)
+        drop_columns(priors, held, solver.layout, at)
+        system = camera_system(solver, values, at)
+        add_priors(priors, values.params, system)
+        pin(priors, held, system)
     return system
 
 
-def _evaluate(solver: _Solver, before: Values, moved: Values, out: Linearization) -> float:
+def _evaluate(solver: SchurSolver, priors: PriorRows, before: Values, moved: Values, out: Linearization) -> float:
     """Cost after a step, with its linearisation. Points that the step carried behind a camera are put back.
 
     inf where that does not help, or a focal length is not positive.
     """
-    layout = solver.layout
-    clip_to_bounds(solver.priors, moved.params)
-    if not np.all(moved.params[:, 0] > 0) or not np.all(moved.params[layout.two_focal, 1] > 0):
+    clip_to_bounds(priors, moved.params)
+    if not np.all(moved.params[:, 0] > 0) or not np.all(moved.params[solver.layout.two_focal, 1] > 0):
         return np.inf
-    cost = linearize(layout, moved, solver.loss, out, solver.workers)
+    cost = linearize(solver, moved, out)
     if not np.isfinite(cost):
         behind = np.flatnonzero(~np.isfinite(out.cost))
         moved.points[behind] = before.points[behind]
-        for p in behind:
-            linearize_points_numba(
-                p, p + 1, layout.view, layout.point_start, layout.pixels, layout.scale_of_view, layout.camera_of_view,
-                layout.model, layout.active, layout.num_active, moved.R, moved.t, moved.points, moved.params,
-                *solver.loss, out.B, out.residual, out.J_camera, out.V, out.g_point, out.cost,
-            )  # fmt: skip
-            if not np.isfinite(out.cost[p]):
+        for p in behind.tolist():
+            if not np.isfinite(linearize_point(solver, moved, p, out)):
                 return np.inf
         cost = float(np.sum(out.cost))
-    return cost + solver.priors.cost(moved.params)
+    return cost + priors.cost(moved.params)
 
 
 def in_front(problem: BundleProblem) -> Bool[np.ndarray, "o"]:
@@ -246,7 +223,7 @@ def _with_values(problem: BundleProblem, layout: BundleLayout, values: Values) -
     """The problem at other values; fixed parts keep their bits."""
     points = np.empty_like(values.points)
     points[layout.point_order] = values.points
-    R, moved = values.R.copy(), layout.listed_view[: layout.num_slots]
+    R, moved = values.R.copy(), layout.view_order[: layout.num_free_views]
     R[moved] = nearest_rotation(R[moved])  # or the rounding of many adjustments adds up
     cameras = tuple(
         replace(camera, params=row[: len(camera.params)].copy()) if mask.any() else camera

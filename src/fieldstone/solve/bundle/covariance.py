@@ -5,25 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fieldstone.geometry.rotation import skew
-from fieldstone.solve.bundle.adjustment import LOSS_NUMBERS, BundleOptions, in_front
+from fieldstone.solve.bundle.adjustment import BundleOptions, in_front
+from fieldstone.solve.bundle.buffers import ReducedSystem, SolverBuffers, allocate_linearization, start_values
 from fieldstone.solve.bundle.camera_prior import add_priors, prior_rows
-from fieldstone.solve.bundle.layout import BundleLayout, lay_out
+from fieldstone.solve.bundle.layout import BundleLayout, free_view_of_camera, lay_out
 from fieldstone.solve.bundle.problem import BundleProblem
-from fieldstone.solve.bundle.schur_solver import (
-    Linearization,
-    Workers,
-    Workspace,
-    allocate,
-    allocate_linearization,
-    camera_system,
-    linearize,
-    reduce_system,
-    start_values,
-    tile_pattern,
-)
+from fieldstone.solve.bundle.schur_solver import camera_system, linearize, reduce_system, schur_solver
+from fieldstone.solve.bundle.tile_pattern import tile_pattern
+from fieldstone.solve.bundle.workers import Workers
 
 GAUGE_FREEDOMS = 7
 MAX_COLUMNS = 12_000
@@ -65,52 +57,44 @@ def bundle_covariance(
     """
     options = options or BundleOptions()
     layout = lay_out(problem, in_front(problem))
-    columns = layout.num_columns + layout.num_border
+    columns = layout.num_columns + layout.num_shared
     if columns > MAX_COLUMNS:
         raise ValueError(f"covariance inverts a dense matrix of {columns} columns; {MAX_COLUMNS} are allowed")
-    values = start_values(problem, layout)
-    seen = layout.point_start[1:] > layout.point_start[:-1]
-    pivot = np.median(values.points[seen], axis=0)
-    pattern, workers = tile_pattern(layout, None), Workers(None, 1)
-    work, at = allocate(layout, pattern), allocate_linearization(layout)
-    linearize(layout, values, (LOSS_NUMBERS[options.loss], options.loss_scale_px**2), at, workers)
-    system = camera_system(layout, values, pivot, at, work, workers)
+    values, at = start_values(problem, layout), allocate_linearization(layout)
+    solver = schur_solver(layout, tile_pattern(layout, None), options.kernel_loss, Workers(None, 1))
+    linearize(solver, values, at)
+    system = camera_system(solver, values, at)
     add_priors(prior_rows(problem, layout, options.camera_priors), values.params, system)
-    reduced = reduce_system(layout, pattern, values, pivot, at, system, 0.0, work, workers)
-    S = _dense(layout, pattern.given_index, work.tiles, reduced.border, reduced.corner)
+    S = _dense(layout, solver.pattern.given_index, reduce_system(solver, values, at, system, 0.0))
 
     num_fixed_views, num_fixed_points = int(problem.fixed_views.sum()), int(problem.fixed_points.sum())
     held = num_fixed_views >= 2 or num_fixed_points >= 3 or (num_fixed_views >= 1 and num_fixed_points >= 1)
-    length = float(np.median(np.linalg.norm(values.points[seen] - pivot, axis=1)))
+    offsets, seen = values.points - layout.pivot, layout.point_start[1:] > layout.point_start[:-1]
+    length = float(np.median(np.linalg.norm(offsets[seen], axis=1)))
     S_inv = sigma_px**2 * (_inverse(S) if held else _inner_inverse(S, layout, length))
-
-    of_views = np.zeros((problem.num_views, 6, 6))
-    turn_about_origin = np.eye(6)
-    turn_about_origin[3:, :3] = skew(pivot)  # v at the origin = v at the pivot + pivot x omega
-    for i, v in enumerate(layout.listed_view[: layout.num_slots]):
-        first = i * layout.block
-        of_views[v] = turn_about_origin @ S_inv[first : first + 6, first : first + 6] @ turn_about_origin.T
     return BundleCovariance(
-        of_views,
+        _views(problem, layout, S_inv),
         _cameras(problem, layout, S_inv),
-        _points(problem, layout, values.points - pivot, at, work, S_inv, sigma_px),
+        _points(layout, offsets, solver.buffers, S_inv, sigma_px),
         "held" if held else "inner",
     )
 
 
-def _dense(layout: BundleLayout, index, tiles, border, corner) -> Float[np.ndarray, "n n"]:
-    """The reduced camera system as one symmetric matrix, views first, then the border."""
-    s, b, n = layout.num_slots, layout.block, layout.num_border
-    count, per_tile = len(index), tiles.shape[1]
+def _dense(
+    layout: BundleLayout, tile_index: Int[np.ndarray, "t t"], reduced: ReducedSystem
+) -> Float[np.ndarray, "n n"]:
+    """The reduced camera system as one symmetric matrix, free views first, then shared intrinsics."""
+    s, b, n = layout.num_free_views, layout.block, layout.num_shared
+    count, per_tile = len(tile_index), reduced.tiles.shape[1]
     size = per_tile * b
     views = np.zeros((count * size, count * size))
-    for i, j in zip(*np.nonzero(index >= 0), strict=True):
-        tile = tiles[index[i, j]].transpose(0, 2, 1, 3).reshape(size, size)
+    for i, j in zip(*np.nonzero(tile_index >= 0), strict=True):
+        tile = reduced.tiles[tile_index[i, j]].transpose(0, 2, 1, 3).reshape(size, size)
         views[i * size : (i + 1) * size, j * size : (j + 1) * size] = np.tril(tile) if i == j else tile
     S = np.zeros((s * b + n, s * b + n))
     S[: s * b, : s * b] = views[: s * b, : s * b]
-    S[s * b :, : s * b] = border.reshape(n, s * b)
-    S[s * b :, s * b :] = np.tril(corner)
+    S[s * b :, : s * b] = reduced.border.reshape(n, s * b)
+    S[s * b :, s * b :] = np.tril(reduced.corner)
     return np.tril(S) + np.tril(S, -1).T
 
 
@@ -132,7 +116,7 @@ def _inner_inverse(S: Float[np.ndarray, "n n"], layout: BundleLayout, length: fl
     """
     pose = np.zeros(len(S), dtype=bool)
     unit = np.ones(len(S))
-    for i in range(layout.num_slots):
+    for i in range(layout.num_free_views):
         pose[i * layout.block : i * layout.block + 6] = True
         unit[i * layout.block + 3 : i * layout.block + 6] = length
     A, C, D = S[np.ix_(pose, pose)], S[np.ix_(~pose, pose)], S[np.ix_(~pose, ~pose)]
@@ -151,52 +135,74 @@ def _inner_inverse(S: Float[np.ndarray, "n n"], layout: BundleLayout, length: fl
     return out
 
 
+def _views(problem: BundleProblem, layout: BundleLayout, S_inv: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "v 6 6"]:
+    """Blocks of the poses, turned about the origin instead of the pivot."""
+    out = np.zeros((problem.num_views, 6, 6))
+    turn_about_origin = np.eye(6)
+    turn_about_origin[3:, :3] = skew(layout.pivot)  # v at the origin = v at the pivot + pivot x omega
+    for i, v in enumerate(layout.view_order[: layout.num_free_views]):
+        first = i * layout.block
+        out[v] = turn_about_origin @ S_inv[first : first + 6, first : first + 6] @ turn_about_origin.T
+    return out
+
+
 def _cameras(
     problem: BundleProblem, layout: BundleLayout, S_inv: Float[np.ndarray, "n n"]
 ) -> tuple[Float[np.ndarray, "_ _"], ...]:
     """Blocks of the cameras, in the order of their parameters."""
-    slot_of_camera = {int(layout.camera_of_view[v]): i for i, v in enumerate(layout.listed_view[: layout.num_slots])}
+    view_of_camera = free_view_of_camera(layout)
     out = []
     for c, camera in enumerate(problem.cameras):
         block = np.zeros((len(camera.params), len(camera.params)))
-        active = layout.active[c, : layout.num_active[c]]
-        if layout.own[c] or layout.border_of_camera[c] >= 0:
+        refined = layout.refined[c, : layout.num_refined[c]]
+        if layout.per_view[c] or layout.shared_row[c] >= 0:
             first = (
-                slot_of_camera[c] * layout.block + 6
-                if layout.own[c]
-                else layout.num_columns + int(layout.border_of_camera[c])
+                view_of_camera[c] * layout.block + 6
+                if layout.per_view[c]
+                else layout.num_columns + int(layout.shared_row[c])
             )
-            block[np.ix_(active, active)] = S_inv[first : first + len(active), first : first + len(active)]
+            block[np.ix_(refined, refined)] = S_inv[first : first + len(refined), first : first + len(refined)]
         out.append(block)
     return tuple(out)
 
 
 def _points(
-    problem: BundleProblem, layout: BundleLayout, offsets: Float[np.ndarray, "p 3"], at: Linearization,
-    work: Workspace, S_inv: Float[np.ndarray, "n n"], sigma_px: float,
-) -> Float[np.ndarray, "p 3 3"]:  # fmt: skip
+    layout: BundleLayout,
+    offsets: Float[np.ndarray, "p 3"],
+    buffers: SolverBuffers,
+    S_inv: Float[np.ndarray, "n n"],
+    sigma_px: float,
+) -> Float[np.ndarray, "p 3 3"]:
     """V^-1 + L^-T Z S^-1 Z^T L^-1 of every free point."""
     out = np.zeros((len(offsets), 3, 3))
-    for p in np.flatnonzero(layout.free_point):
-        a0, a1, a2, a3, a4, a5 = work.L_inv[p]
+    for p in np.flatnonzero(layout.free_point).tolist():
+        a0, a1, a2, a3, a4, a5 = buffers.L_inv[p]
         L_inv = np.array([[a0, 0.0, 0.0], [a1, a2, 0.0], [a3, a4, a5]])
         if not a0 * a2 * a5 > 0 or np.linalg.cond(L_inv) > 1e8:
             out[layout.point_order[p]] = np.nan
             continue
-        Z, columns = [], []
-        for o in range(layout.point_start[p], layout.point_start[p + 1]):
-            if layout.slot[o] >= 0:
-                h = work.Z[o]
-                Z.append(np.concatenate([np.cross(offsets[p], h[:, :3]), h], axis=1))
-                columns.append(layout.slot[o] * layout.block + np.arange(layout.block))
-        for e in range(layout.entry_start[p], layout.entry_start[p + 1]):
-            c = layout.entry_camera[e]
-            count = int(layout.num_active[c])
-            Z.append(work.Z_border[e, :, :count])
-            columns.append(layout.num_columns + layout.border_of_camera[c] + np.arange(count))
         inner = sigma_px**2 * np.eye(3)
-        if Z:
-            Z_p, at_columns = np.concatenate(Z, axis=1), np.concatenate(columns)
-            inner = inner + Z_p @ S_inv[np.ix_(at_columns, at_columns)] @ Z_p.T
+        Z, columns = _point_coupling(layout, offsets[p], buffers, p)
+        if len(columns):
+            inner = inner + Z @ S_inv[np.ix_(columns, columns)] @ Z.T
         out[layout.point_order[p]] = L_inv.T @ inner @ L_inv
     return out
+
+
+def _point_coupling(
+    layout: BundleLayout, offset: Float[np.ndarray, "3"], buffers: SolverBuffers, p: int
+) -> tuple[Float[np.ndarray, "3 k"], Int[np.ndarray, "k"]]:
+    """Z of one point, and the columns of the reduced system that it belongs to."""
+    couplings = layout.couplings
+    Z, columns = [np.empty((3, 0))], [np.empty(0, dtype=np.int64)]
+    for o in range(layout.point_start[p], layout.point_start[p + 1]):
+        if layout.free_index[o] >= 0:
+            h = buffers.Z[o]
+            Z.append(np.concatenate([np.cross(offset, h[:, :3]), h], axis=1))
+            columns.append(layout.free_index[o] * layout.block + np.arange(layout.block))
+    for e in range(couplings.start[p], couplings.start[p + 1]):
+        c = couplings.camera[e]
+        count = int(layout.num_refined[c])
+        Z.append(buffers.Z_shared[e, :, :count])
+        columns.append(layout.num_columns + layout.shared_row[c] + np.arange(count))
+    return np.concatenate(Z, axis=1), np.concatenate(columns)

@@ -3,10 +3,11 @@
 Every kernel works on a range of points or views, writes only what belongs to that range, and adds in a fixed order.
 Ranges can therefore run in any number of threads, and the result has the same bits.
 
-Notation, for observation o of point p by the view in slot i (Cholesky: V + damping = L L^T, V the 3x3 block of p):
-Z (3, block) = L^-1 B^T [pose Jacobian | own camera Jacobian], with the Jacobians of `linearize_numba`, so that the
-reduced system loses Z_i^T Z_j for every point that slots i and j share. The rows of Z are [d x h, h, own] with
-h = L^-1 B^T B: only [h, own] is stored, (3, block - 3), and the rotation's part d x h is made where it is needed.
+Notation, for observation o of point p by free view i (Cholesky: V + damping = L L^T, V the 3x3 block of p):
+Z (3, block) = L^-1 B^T [pose Jacobian | Jacobian K of per-view intrinsics], with the Jacobians of `linearize_numba`, so
+that the reduced system loses Z_i^T Z_j for every point that views i and j share. The rows of Z are [d x h, h, k] with
+h = L^-1 B^T B and k = L^-1 B^T K: only [h, k] is stored, (3, block - 3), and the rotation's part d x h is made where it
+is needed. Z_shared is the same for the shared intrinsics of a coupling, summed over its observations.
 """
 
 from __future__ import annotations
@@ -19,33 +20,37 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def mark_shared_tiles_numba(point_start, slot, free_point, per_tile, exists):
-    """Set exists[I, J], J <= I, where a free point is seen by slots of tile I and of tile J."""
+def mark_shared_tiles_numba(layout, per_tile, exists):
+    """Set exists[I, J], J <= I, where a free point is seen by free views of tile I and of tile J."""
+    point_start, free_index, free_point = layout.point_start, layout.free_index, layout.free_point
     for p in range(len(free_point)):
         if not free_point[p]:
             continue
         for o in range(point_start[p], point_start[p + 1]):
-            for o2 in range(point_start[p], o + 1 if slot[o] >= 0 else 0):
-                if slot[o2] >= 0:
-                    exists[slot[o] // per_tile, slot[o2] // per_tile] = True
+            for o2 in range(point_start[p], o + 1 if free_index[o] >= 0 else 0):
+                if free_index[o2] >= 0:
+                    exists[free_index[o] // per_tile, free_index[o2] // per_tile] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def eliminate_points_numba(
-    start, stop, view, slot, point_start, camera_of_view, num_active, own, entry_start, entry_of_obs, free_point,
-    B, J_camera, V, g_point, damping, L_inv, y, Z, Z_border,
-):  # fmt: skip
-    """L_inv (p, 6 lower), y = L^-1 g (p, 3), Z (o, 3, block - 3) and Z_border (e, 3, a) for V + damping diag(V).
+def eliminate_points_numba(start, stop, layout, at, damping, buffers):
+    """L_inv (lower), y = L^-1 g, Z and Z_shared of the points `start` to `stop`, for V + damping diag(V).
 
     Held points, and points whose block is singular, get L_inv = 0: they do not move in this step.
     """
+    view, free_index = layout.view_of_obs, layout.free_index
+    point_start, free_point = layout.point_start, layout.free_point
+    camera_of_view, num_refined, per_view = layout.camera_of_view, layout.num_refined, layout.per_view
+    coupling_start, coupling_of_obs = layout.couplings.start, layout.couplings.of_obs
+    B, J_camera, V, g_point = at.B, at.J_camera, at.V, at.g_point
+    L_inv, y, Z, Z_shared = buffers.L_inv, buffers.y, buffers.Z, buffers.Z_shared
     grow = 1.0 + damping
     for p in range(start, stop):
-        for e in range(entry_start[p], entry_start[p + 1]):
+        for e in range(coupling_start[p], coupling_start[p + 1]):
             for k in range(3):
-                for a in range(Z_border.shape[2]):
-                    Z_border[e, k, a] = 0.0
+                for a in range(Z_shared.shape[2]):
+                    Z_shared[e, k, a] = 0.0
         a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if free_point[p]:
             a0, a1, a2, a3, a4, a5 = inverse_cholesky_numba(
@@ -57,26 +62,26 @@ def eliminate_points_numba(
         y[p, 2] = a3 * g_point[p, 0] + a4 * g_point[p, 1] + a5 * g_point[p, 2]
         for o in range(point_start[p], point_start[p + 1]):
             c = camera_of_view[view[o]]
-            e = entry_of_obs[o]
-            in_slot = slot[o] >= 0
-            if not in_slot and e < 0:
+            e = coupling_of_obs[o]
+            is_free = free_index[o] >= 0
+            if not is_free and e < 0:
                 continue
-            num_own = num_active[c] if own[c] else 0
+            num_per_view = num_refined[c] if per_view[c] else 0
             for k in range(3):
                 m0 = a0 if k == 0 else (a1 if k == 1 else a3)
                 m1 = 0.0 if k == 0 else (a2 if k == 1 else a4)
                 m2 = a5 if k == 2 else 0.0
                 q0 = B[o, 0, 0] * m0 + B[o, 0, 1] * m1 + B[o, 0, 2] * m2
                 q1 = B[o, 1, 0] * m0 + B[o, 1, 1] * m1 + B[o, 1, 2] * m2
-                if in_slot:
+                if is_free:
                     Z[o, k, 0] = q0 * B[o, 0, 0] + q1 * B[o, 1, 0]
                     Z[o, k, 1] = q0 * B[o, 0, 1] + q1 * B[o, 1, 1]
                     Z[o, k, 2] = q0 * B[o, 0, 2] + q1 * B[o, 1, 2]
                     for a in range(Z.shape[2] - 3):
-                        Z[o, k, 3 + a] = q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a] if a < num_own else 0.0
+                        Z[o, k, 3 + a] = q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a] if a < num_per_view else 0.0
                 if e >= 0:
-                    for a in range(num_active[c]):
-                        Z_border[e, k, a] += q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a]
+                    for a in range(num_refined[c]):
+                        Z_shared[e, k, a] += q0 * J_camera[o, 0, a] + q1 * J_camera[o, 1, a]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -136,7 +141,7 @@ def _subtract_pose_product_numba(d0, d1, d2, z, w, target):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _unfold_numba(d0, d1, d2, z, full):
-    """full (3, block) = [d x h, h, own] from the stored z = [h, own]."""
+    """full (3, block) = [d x h, h, k] from the stored z = [h, k]."""
     for k in range(3):
         h0, h1, h2 = z[k, 0], z[k, 1], z[k, 2]
         full[k, 0] = d1 * h2 - d2 * h1
@@ -148,25 +153,28 @@ def _unfold_numba(d0, d1, d2, z, full):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def reduce_rows_numba(
-    start, stop, step, list_start, list_obs, slot, point, point_start, free_point, entry_start, entry_camera,
-    num_active, border_of_camera, tile_index, tiles, points, pivot, U, g, cross, damping, y, Z, Z_border, border, rhs,
-):  # fmt: skip
-    """Block rows `start:stop:step` of the reduced camera system into tiles (tile, row, column, block, block).
+def reduce_rows_numba(start, stop, step, layout, tile_index, values, system, damping, buffers):
+    """Block rows `start:stop:step` of the reduced camera system into `buffers.reduced`.
 
-    S_ij = [i = j] (U_i + damping diag) - sum over common points Z_i^T Z_j for slots j <= i;
-    rhs (s, block) = -g_i + sum Z_i^T y; border (rows, s, block) = cross - sum Z_border^T Z_i.
+    S_ij = [i = j] (U_i + damping diag) - sum over common points Z_i^T Z_j for free views j <= i;
+    rhs_i = -g_i + sum Z_i^T y; border_i = cross_i - sum Z_shared^T Z_i.
     Pairs without a tile are left out (block-diagonal preconditioners ask for few tiles).
     """
+    view_start, view_obs, free_index, point = layout.view_start, layout.view_obs, layout.free_index, layout.point_of_obs
+    point_start, free_point, pivot, points = layout.point_start, layout.free_point, layout.pivot, values.points
+    coupling_start, coupling_camera = layout.couplings.start, layout.couplings.camera
+    num_refined, shared_row = layout.num_refined, layout.shared_row
+    U, g, cross, y, Z, Z_shared = system.U, system.g, system.cross, buffers.y, buffers.Z, buffers.Z_shared
+    tiles, border, rhs = buffers.reduced.tiles, buffers.reduced.border, buffers.reduced.rhs
     per_tile = tiles.shape[1]
     block = Z.shape[2] + 3
     z = np.empty((3, block))
     w = np.empty((3, block))
-    tile_of_slot = np.empty(stop, dtype=np.int64)
+    tile_of_view = np.empty(stop, dtype=np.int64)
     for i in range(stop):
-        tile_of_slot[i] = i // per_tile
+        tile_of_view[i] = i // per_tile
     for i in range(start, stop, step):
-        tile_row = tile_of_slot[i]
+        tile_row = tile_of_view[i]
         local_row = i - tile_row * per_tile
         for J in range(tile_row + 1):
             tile = tile_index[tile_row, J]
@@ -182,8 +190,8 @@ def reduce_rows_numba(
             diagonal[a, a] += damping * U[i, a, a]
             for b in range(border.shape[0]):
                 border[b, i, a] = cross[b, i, a]
-        for m in range(list_start[i], list_start[i + 1]):
-            o = list_obs[m]
+        for m in range(view_start[i], view_start[i + 1]):
+            o = view_obs[m]
             p = point[o]
             if not free_point[p]:
                 continue
@@ -192,12 +200,12 @@ def reduce_rows_numba(
             for a in range(block):
                 rhs[i, a] += z[0, a] * y[p, 0] + z[1, a] * y[p, 1] + z[2, a] * y[p, 2]
             for o2 in range(point_start[p], point_start[p + 1]):
-                j = slot[o2]
+                j = free_index[o2]
                 if j < 0:
                     continue
                 if j > i:
                     break
-                J = tile_of_slot[j]
+                J = tile_of_view[j]
                 tile = tile_index[tile_row, J]
                 if tile < 0:
                     continue
@@ -210,46 +218,45 @@ def reduce_rows_numba(
                         z0, z1, z2 = z[0, a], z[1, a], z[2, a]
                         for b in range(block):
                             target[a, b] -= z0 * w[0, b] + z1 * w[1, b] + z2 * w[2, b]
-            for e in range(entry_start[p], entry_start[p + 1]):
-                c = entry_camera[e]
-                for k in range(num_active[c]):
-                    e0, e1, e2 = Z_border[e, 0, k], Z_border[e, 1, k], Z_border[e, 2, k]
+            for e in range(coupling_start[p], coupling_start[p + 1]):
+                c = coupling_camera[e]
+                for k in range(num_refined[c]):
+                    e0, e1, e2 = Z_shared[e, 0, k], Z_shared[e, 1, k], Z_shared[e, 2, k]
                     for a in range(block):
-                        border[border_of_camera[c] + k, i, a] -= e0 * z[0, a] + e1 * z[1, a] + e2 * z[2, a]
+                        border[shared_row[c] + k, i, a] -= e0 * z[0, a] + e1 * z[1, a] + e2 * z[2, a]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def reduce_border_numba(
-    border_start, border_entries, entry_start, entry_camera, entry_point, num_active, border_of_camera,
-    Z_border, y, corner, rhs_border,
-):  # fmt: skip
-    """Subtract the points from the border's own block `corner` (lower triangle) and right-hand side."""
-    for c in range(len(border_start) - 1):
-        row = border_of_camera[c]
-        for m in range(border_start[c], border_start[c + 1]):
-            e = border_entries[m]
-            p = entry_point[e]
-            for a in range(num_active[c]):
-                z0, z1, z2 = Z_border[e, 0, a], Z_border[e, 1, a], Z_border[e, 2, a]
-                rhs_border[row + a] += z0 * y[p, 0] + z1 * y[p, 1] + z2 * y[p, 2]
-                for e2 in range(entry_start[p], entry_start[p + 1]):
-                    column = border_of_camera[entry_camera[e2]]
+def reduce_corner_numba(layout, buffers):
+    """Subtract the points from `corner` (lower triangle) and `rhs_shared` of the reduced system."""
+    couplings, num_refined, shared_row = layout.couplings, layout.num_refined, layout.shared_row
+    Z_shared, y, corner, rhs_shared = buffers.Z_shared, buffers.y, buffers.reduced.corner, buffers.reduced.rhs_shared
+    for c in range(len(shared_row)):
+        row = shared_row[c]
+        for m in range(couplings.camera_start[c], couplings.camera_start[c + 1]):
+            e = couplings.of_camera[m]
+            p = couplings.point[e]
+            for a in range(num_refined[c]):
+                z0, z1, z2 = Z_shared[e, 0, a], Z_shared[e, 1, a], Z_shared[e, 2, a]
+                rhs_shared[row + a] += z0 * y[p, 0] + z1 * y[p, 1] + z2 * y[p, 2]
+                for e2 in range(couplings.start[p], couplings.start[p + 1]):
+                    column = shared_row[couplings.camera[e2]]
                     if column > row:
                         continue
-                    for b in range(num_active[entry_camera[e2]]):
+                    for b in range(num_refined[couplings.camera[e2]]):
                         corner[row + a, column + b] -= (
-                            z0 * Z_border[e2, 0, b] + z1 * Z_border[e2, 1, b] + z2 * Z_border[e2, 2, b]
+                            z0 * Z_shared[e2, 0, b] + z1 * Z_shared[e2, 1, b] + z2 * Z_shared[e2, 2, b]
                         )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def views_of_point_numba(start, stop, d0, d1, d2, slot, Z, x):
+def views_of_point_numba(start, stop, d0, d1, d2, free_index, Z, x):
     """Sum of Z_i x_i over the views i of the observations `start` to `stop` of a point; d = point - pivot."""
     u0, u1, u2 = 0.0, 0.0, 0.0
     for o in range(start, stop):
-        i = slot[o]
+        i = free_index[o]
         if i < 0:
             continue
         w0, w1, w2 = x[i, 0], x[i, 1], x[i, 2]
@@ -268,28 +275,29 @@ def views_of_point_numba(start, stop, d0, d1, d2, slot, Z, x):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def move_points_numba(
-    start, stop, slot, point_start, entry_start, entry_camera, num_active, border_of_camera, points, pivot,
-    V, g_point, damping, L_inv, y, Z, Z_border, dx, dx_border, points_new, decrease,
-):  # fmt: skip
-    """Points that belong to the step dx (s, block), dx_border of the cameras: step = -L^-T (y + sum Z dx).
+def move_points_numba(start, stop, layout, values, at, damping, step, buffers, moved):
+    """Points `start` to `stop` that belong to a step of the views, into `moved`: -L^-T (y + sum Z dx).
 
-    `decrease` (p,) is each point's share of the decrease of the cost that the linear model promises.
+    `buffers.decrease` is each point's part of the decrease of the cost that the linear model promises.
     """
+    free_index, point_start, pivot, points = layout.free_index, layout.point_start, layout.pivot, values.points
+    couplings, num_refined, shared_row = layout.couplings, layout.num_refined, layout.shared_row
+    V, g_point, dx, dx_shared, points_new = at.V, at.g_point, step.dx, step.dx_shared, moved.points
+    L_inv, y, Z, Z_shared, decrease = buffers.L_inv, buffers.y, buffers.Z, buffers.Z_shared, buffers.decrease
     for p in range(start, stop):
         u0, u1, u2 = y[p, 0], y[p, 1], y[p, 2]
         d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
-        v0, v1, v2 = views_of_point_numba(point_start[p], point_start[p + 1], d0, d1, d2, slot, Z, dx)
+        v0, v1, v2 = views_of_point_numba(point_start[p], point_start[p + 1], d0, d1, d2, free_index, Z, dx)
         u0 += v0
         u1 += v1
         u2 += v2
-        for e in range(entry_start[p], entry_start[p + 1]):
-            c = entry_camera[e]
-            for a in range(num_active[c]):
-                step = dx_border[border_of_camera[c] + a]
-                u0 += Z_border[e, 0, a] * step
-                u1 += Z_border[e, 1, a] * step
-                u2 += Z_border[e, 2, a] * step
+        for e in range(couplings.start[p], couplings.start[p + 1]):
+            c = couplings.camera[e]
+            for a in range(num_refined[c]):
+                step = dx_shared[shared_row[c] + a]
+                u0 += Z_shared[e, 0, a] * step
+                u1 += Z_shared[e, 1, a] * step
+                u2 += Z_shared[e, 2, a] * step
         s0 = -(L_inv[p, 0] * u0 + L_inv[p, 1] * u1 + L_inv[p, 3] * u2)
         s1 = -(L_inv[p, 2] * u1 + L_inv[p, 4] * u2)
         s2 = -(L_inv[p, 5] * u2)
@@ -304,10 +312,11 @@ def move_points_numba(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def move_views_numba(num_slots, listed_view, pivot, dx, R, t, R_new, t_new):
-    """Turn pose i about the pivot by exp(omega) and shift it by R v, with dx[i] = (omega, v, ...)."""
-    for i in range(num_slots):
-        v = listed_view[i]
+def move_views_numba(layout, values, step, moved):
+    """Turn every free view about the pivot by exp(omega) and shift it by R v, with dx = (omega, v, ...)."""
+    pivot, dx, R, t, R_new, t_new = layout.pivot, step.dx, values.R, values.t, moved.R, moved.t
+    for i in range(layout.num_free_views):
+        v = layout.view_order[i]
         w0, w1, w2 = dx[i, 0], dx[i, 1], dx[i, 2]
         angle2 = w0 * w0 + w1 * w1 + w2 * w2
         if angle2 < 1e-8:

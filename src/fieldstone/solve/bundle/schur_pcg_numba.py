@@ -11,19 +11,21 @@ from fieldstone.solve.bundle.schur_numba import views_of_point_numba
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def points_of_views_numba(start, stop, slot, point_start, points, pivot, Z, x, w):
-    """w (p, 3) = sum of Z_i x_i over the views i of each point from `start` to `stop`; x (s, block)."""
+def points_of_views_numba(start, stop, layout, values, Z, x, w):
+    """w (p, 3) = sum of Z_i x_i over the free views i of each point from `start` to `stop`; x (s, block)."""
+    point_start, free_index, pivot, points = layout.point_start, layout.free_index, layout.pivot, values.points
     for p in range(start, stop):
         d0, d1, d2 = points[p, 0] - pivot[0], points[p, 1] - pivot[1], points[p, 2] - pivot[2]
-        w[p, 0], w[p, 1], w[p, 2] = views_of_point_numba(point_start[p], point_start[p + 1], d0, d1, d2, slot, Z, x)
+        first, end = point_start[p], point_start[p + 1]
+        w[p, 0], w[p, 1], w[p, 2] = views_of_point_numba(first, end, d0, d1, d2, free_index, Z, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def views_of_points_numba(
-    start, stop, list_start, list_obs, point, free_point, points, pivot, Z, U, damping, x, w, out
-):  # fmt: skip
-    """out (s, block) = (U_i + damping diag U_i) x_i - sum of Z_i^T w over the points of each view."""
+def views_of_points_numba(start, stop, layout, values, Z, U, damping, x, w, out):
+    """out (s, block) = (U_i + damping diag U_i) x_i - sum of Z_i^T w over the points of each free view."""
+    view_start, view_obs, point, free_point = layout.view_start, layout.view_obs, layout.point_of_obs, layout.free_point
+    pivot, points = layout.pivot, values.points
     block = U.shape[1]
     for i in range(start, stop):
         for a in range(block):
@@ -31,8 +33,8 @@ def views_of_points_numba(
             for b in range(block):
                 total += U[i, a, b] * x[i, b]
             out[i, a] = total
-        for m in range(list_start[i], list_start[i + 1]):
-            o = list_obs[m]
+        for m in range(view_start[i], view_start[i + 1]):
+            o = view_obs[m]
             p = point[o]
             if not free_point[p]:
                 continue

@@ -1,4 +1,4 @@
-"""The damped step of poses and cameras: the reduced system is factored, or where that is too dear, solved in steps."""
+"""The damped step of poses and intrinsics: the reduced system is factored or, where that is expensive, iterated on."""
 
 from __future__ import annotations
 
@@ -12,78 +12,68 @@ from fieldstone.solve.algebra.tile_cholesky_numba import (
     factor_numba,
     solve_transposed_numba,
 )
-from fieldstone.solve.bundle.layout import BundleLayout
+from fieldstone.solve.bundle.buffers import CameraSystem, Linearization, Step, Values
 from fieldstone.solve.bundle.schur_pcg import TOLERANCE, solve_iteratively
-from fieldstone.solve.bundle.schur_solver import (
-    CameraSystem,
-    Linearization,
-    ReducedSystem,
-    Step,
-    TilePattern,
-    Values,
-    Workers,
-    Workspace,
-    reduce_system,
-)
+from fieldstone.solve.bundle.schur_solver import SchurSolver, reduce_system
 
 
 def solve_step(
-    layout: BundleLayout, pattern: TilePattern, values: Values, pivot: Float[np.ndarray, "3"], at: Linearization,
-    system: CameraSystem, damping: float, work: Workspace, workers: Workers, *, pcg_tolerance: float = TOLERANCE,
-) -> Step | None:  # fmt: skip
-    """The damped step of poses and cameras; None where the reduced system is not positive definite."""
-    reduced = reduce_system(layout, pattern, values, pivot, at, system, damping, work, workers)
-    if pattern.direct:
-        solution = _solve_reduced(pattern, reduced, work, workers)
+    solver: SchurSolver,
+    values: Values,
+    at: Linearization,
+    system: CameraSystem,
+    damping: float,
+    *,
+    pcg_tolerance: float = TOLERANCE,
+) -> Step | None:
+    """The damped step of poses and intrinsics; None where the reduced system is not positive definite."""
+    reduce_system(solver, values, at, system, damping)
+    if solver.pattern.direct:
+        solution = _solve_reduced(solver)
     else:
-        solution = solve_iteratively(
-            layout, pattern, values, pivot, system, reduced, damping, work, workers, tolerance=pcg_tolerance
-        )
+        solution = solve_iteratively(solver, values, system, damping, tolerance=pcg_tolerance)
     if solution is None:
         return None
-    dx, dx_border = solution
+    dx, dx_shared = solution
     # Holds for the exact solution and for every iterate of conjugate gradients: d (H + damping diag H) d = -g d.
     promised = np.sum((damping * np.einsum("saa->sa", system.U) * dx - system.g) * dx)
-    promised += np.sum((damping * np.diag(system.corner) * dx_border - system.g_border) * dx_border)
-    return Step(dx, dx_border, 0.5 * float(promised))
+    promised += np.sum((damping * np.diag(system.corner) * dx_shared - system.g_shared) * dx_shared)
+    return Step(dx, dx_shared, 0.5 * float(promised))
 
 
-def _solve_reduced(
-    pattern: TilePattern, reduced: ReducedSystem, work: Workspace, workers: Workers
-) -> tuple[Float[np.ndarray, "s b"], Float[np.ndarray, "n"]] | None:
-    """Solve [[S, border^T], [border, corner]] [dx; dx_border] = [rhs; rhs_border] by block elimination."""
-    border, rhs, corner, rhs_border = reduced.border, reduced.rhs, reduced.corner, reduced.rhs_border
+def _solve_reduced(solver: SchurSolver) -> tuple[Float[np.ndarray, "s b"], Float[np.ndarray, "n"]] | None:
+    """Solve [[S, border^T], [border, corner]] [dx; dx_shared] = [rhs; rhs_shared] by block elimination."""
+    pattern, buffers, (_, border, rhs, corner, rhs_shared) = solver.pattern, solver.buffers, solver.buffers.reduced
     n, (s, b) = len(border), rhs.shape
     count, size = len(pattern.index), pattern.per_tile * b
     wide = np.zeros((n + 1, count * size))
     wide[:n, : s * b] = border.reshape(n, s * b)
     wide[n, : s * b] = rhs.ravel()
     wide = np.ascontiguousarray(wide.reshape(n + 1, count, size).swapaxes(0, 1))
-    if not _factor(pattern, wide, s, work, workers):
+    if not _factor(solver, wide):
         return None
     flat = wide.swapaxes(0, 1).reshape(n + 1, count * size)
-    dx_border = np.zeros(n)
+    dx_shared = np.zeros(n)
     if n:
         corner = corner - flat[:n] @ flat[:n].T
         if not cholesky_in_place_numba(corner):
             return None
-        dx_border = _solve_lower(corner, rhs_border - flat[:n] @ flat[n])
-    x = np.ascontiguousarray((flat[n] - dx_border @ flat[:n]).reshape(count, size))
-    solve_transposed_numba(pattern.index, work.L, work.diagonal_inverse, x)
+        dx_shared = _solve_lower(corner, rhs_shared - flat[:n] @ flat[n])
+    x = np.ascontiguousarray((flat[n] - dx_shared @ flat[:n]).reshape(count, size))
+    solve_transposed_numba(pattern.index, buffers.L, buffers.diagonal_inverse, x)
     dx = x.ravel()[: s * b].reshape(s, b)
-    if not (np.all(np.isfinite(dx)) and np.all(np.isfinite(dx_border))):
+    if not (np.all(np.isfinite(dx)) and np.all(np.isfinite(dx_shared))):
         return None
-    return dx, dx_border
+    return dx, dx_shared
 
 
-def _factor(
-    pattern: TilePattern, wide: Float[np.ndarray, "t r n"], num_slots: int, work: Workspace, workers: Workers
-) -> bool:
+def _factor(solver: SchurSolver, wide: Float[np.ndarray, "t r n"]) -> bool:
     """Tile Cholesky of the reduced system; `wide` becomes the rows below it."""
-    args = (work.tiles, pattern.index, work.L, work.diagonal_inverse, num_slots)
-    if workers.threads == 1 or len(pattern.index) < 8:
+    index, workers, buffers = solver.pattern.index, solver.workers, solver.buffers
+    args = (buffers.reduced.tiles, index, buffers.L, buffers.diagonal_inverse, solver.layout.num_free_views)
+    if workers.threads == 1 or len(index) < 8:
         return factor_numba(*args, wide)
-    for J in range(len(pattern.index)):
+    for J in range(len(index)):
         if not factor_diagonal_numba(J, *args):
             return False
         bounds = [(J, k, workers.threads) for k in range(workers.threads)]
