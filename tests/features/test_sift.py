@@ -125,8 +125,8 @@ def test_options_refuse_nonsense():
         lambda: SiftOptions(max_features=0),
         lambda: SiftOptions(max_image_size=0),
         lambda: SiftOptions(contrast_threshold=0.0),
-        lambda: SiftOptions(first_look=0.0),
-        lambda: SiftOptions(enough=1.5),
+        lambda: SiftOptions(coarse_ratio=0.0),
+        lambda: SiftOptions(enough_ratio=1.5),
         lambda: SiftOptions(cells_per_axis=0),
     ):
         with pytest.raises(ValueError):
@@ -160,28 +160,28 @@ def test_the_strongest_alone_are_described_as_among_all():
 
 
 @pytest.mark.parametrize(
-    ("size", "looks"),
+    ("size", "sizes"),
     [((3000, 2000), (1040, 1600)), ((1500, 1000), (1040, 1500)), ((1000, 1250), (1250,)), ((80, 60), (80,))],
 )
-def test_a_first_look_is_coarser_where_that_saves_time(size, looks):
-    assert Sift().looks(*size) == looks
-    assert Sift(SiftOptions(first_look=1.0)).looks(*size) == looks[-1:]
+def test_detection_is_coarse_first_where_that_saves_time(size, sizes):
+    assert Sift().detection_sizes(*size) == sizes
+    assert Sift(SiftOptions(coarse_ratio=1.0)).detection_sizes(*size) == sizes[-1:]
 
 
-def test_enough_features_at_the_first_look_are_all_there_is():
+def test_enough_features_at_the_coarse_size_are_all_there_is():
     image = texture(3, 640, 480)
-    options = SiftOptions(max_features=40, max_image_size=640, first_look=0.5)
-    found, coarse = Sift(options)(image), Sift(replace(options, max_image_size=320, first_look=1.0))(image)
-    assert len(found) >= options.enough * options.max_features
+    options = SiftOptions(max_features=40, max_image_size=640, coarse_ratio=0.5)
+    found, coarse = Sift(options)(image), Sift(replace(options, max_image_size=320, coarse_ratio=1.0))(image)
+    assert len(found) >= options.enough_ratio * options.max_features
     np.testing.assert_array_equal(found.keypoints, coarse.keypoints)
     np.testing.assert_array_equal(found.descriptors, coarse.descriptors)
     np.testing.assert_array_equal(found.colors, coarse.colors)
 
 
-def test_too_few_features_are_worth_a_closer_look():
+def test_too_few_features_are_worth_a_finer_detection():
     image = texture(3, 640, 480)
-    options = SiftOptions(max_features=10**5, max_image_size=640, first_look=0.5)
-    found, close = Sift(options)(image), Sift(replace(options, first_look=1.0))(image)
+    options = SiftOptions(max_features=10**5, max_image_size=640, coarse_ratio=0.5)
+    found, close = Sift(options)(image), Sift(replace(options, coarse_ratio=1.0))(image)
     np.testing.assert_array_equal(found.keypoints, close.keypoints)
     np.testing.assert_array_equal(found.descriptors, close.descriptors)
 
@@ -189,7 +189,7 @@ def test_too_few_features_are_worth_a_closer_look():
 def test_a_smaller_picture_of_the_photo_gives_features_in_its_pixels():
     image = texture(3, 640, 480)
     small = np.asarray(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    found = Sift(SiftOptions(max_image_size=320)).look(reduced_grey(small, 320), small, (640, 480))
+    found = Sift(SiftOptions(max_image_size=320)).detect(reduced_grey(small, 320), small, (640, 480))
     alone = Sift(SiftOptions(max_image_size=320))(small)
     np.testing.assert_allclose(found.keypoints, 2 * alone.keypoints, rtol=1e-12)
     np.testing.assert_allclose(found.scale, 2 * alone.scale, rtol=1e-12)

@@ -6,7 +6,7 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.model.calibration import LADDER, as_model, growing_step, priors, steps_above
+from fieldstone.mapping.model.calibration import CANDIDATE_STEPS, as_model, first_step, priors, richer_steps
 from fieldstone.scene.alignment import align
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
@@ -17,7 +17,7 @@ RADIAL = Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, -0.05]))
 FISHEYE = Camera("OPENCV_FISHEYE", 1000, 750, np.array([520.0, 521.0, 508.0, 371.0, 0.03, -0.01, 0.004, -0.001]))
 
 
-@pytest.mark.parametrize("step", LADDER[:-1], ids=lambda step: f"{step.model} {len(step.free)}")
+@pytest.mark.parametrize("step", CANDIDATE_STEPS[:-1], ids=lambda step: f"{step.model} {len(step.free)}")
 def test_a_camera_in_a_richer_model_sees_the_same(step):
     points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], size=(50, 3))
     rich = as_model(PLAIN, step.model)
@@ -56,19 +56,21 @@ def test_what_is_given_is_refined_in_the_first_model_that_expresses_it():
     }
     for model, all_of_it in cameras.items():
         for camera in all_of_it:
-            step = growing_step(camera)
+            step = first_step(camera)
             assert step.model == model
             as_model(camera, model)
-            assert not any("cx" in other.free for other in steps_above(step, principal_point=False))
+            assert not any("cx" in other.free for other in richer_steps(step, principal_point=False))
 
 
 def test_every_step_above_refines_more():
-    for step in LADDER:
-        above = steps_above(step)
+    for step in CANDIDATE_STEPS:
+        above = richer_steps(step)
         assert step not in above
         assert all(set(other.free) > set(step.free) for other in above if other.model == step.model)
-        assert [LADDER.index(other) for other in above] == sorted(LADDER.index(other) for other in above)
-    assert steps_above(LADDER[-1]) == []
+        assert [CANDIDATE_STEPS.index(other) for other in above] == sorted(
+            CANDIDATE_STEPS.index(other) for other in above
+        )
+    assert richer_steps(CANDIDATE_STEPS[-1]) == []
 
 
 def map_with(truth: Camera, start: Camera, **scene_options):

@@ -47,7 +47,7 @@ def test_exact_matches_give_exact_poses():
 
 
 def test_unknown_cameras_are_calibrated_by_their_own_photos():
-    """No EXIF, focal length 800 px, principal point off the centre: by vote, bundle adjustment and the ladder.
+    """No EXIF, focal length 800 px, principal point off the centre: by vote, bundle adjustment and model selection.
 
     All axes meet in one point here, which is where a vote on fundamental matrices is at its worst.
     """

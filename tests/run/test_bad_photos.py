@@ -43,7 +43,7 @@ def photos(house_photos, tmp_path) -> Path:
 
 
 def matched(photos: Path, options: MatchingOptions = OPTIONS):
-    return match_photos(photos, options, 0, lambda stage: None, Workspace())
+    return match_photos(photos, options, 0, Workspace())
 
 
 def test_no_features_under_masks(photos, tmp_path):
@@ -57,10 +57,10 @@ def test_no_features_under_masks(photos, tmp_path):
     assert max(k[:, 0].max() for k in graph.keypoints) < 200.0
     workspace = Workspace(tmp_path / "units")
     for _ in range(2):
-        again = match_photos(photos, options, 0, lambda stage: None, workspace).graph
+        again = match_photos(photos, options, 0, workspace).graph
         np.testing.assert_array_equal(again.keypoints[3], graph.keypoints[3])
     Image.fromarray(255 - keep).save(tmp_path / "masks" / "house_03.jpg.png")
-    changed = match_photos(photos, options, 0, lambda stage: None, workspace).graph
+    changed = match_photos(photos, options, 0, workspace).graph
     assert changed.keypoints[3][:, 0].min() >= 200.0
     np.testing.assert_array_equal(changed.keypoints[2], graph.keypoints[2])
 

@@ -80,14 +80,14 @@ def uninterrupted(house_photos, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 6))])
 def test_a_run_killed_while_writing_ends_with_the_same_bytes(house_photos, uninterrupted, tmp_path, seed):
-    """Six writes keep features, one matches, one their geometry, four the growing model; then come the results."""
+    """Six writes keep features, one matches, one their geometry, four states of the mapper; then come the results."""
     for write in np.random.default_rng(seed).integers(1, 16, size=2).tolist():
         assert start(house_photos, tmp_path / "out", kill_at_write=write).wait() in (-signal.SIGKILL, 0)
     assert start(house_photos, tmp_path / "out").wait() == 0
     assert results(tmp_path / "out") == results(uninterrupted)
     assert not list((tmp_path / "out").rglob(".writing-*"))
     assert not (tmp_path / "out" / "work" / "lock").exists()
-    assert not list((tmp_path / "out" / "work").rglob("growth/*"))
+    assert not list((tmp_path / "out" / "work").rglob("mapper/*"))
 
 
 @pytest.mark.slow

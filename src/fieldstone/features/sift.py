@@ -15,8 +15,8 @@ DESCRIPTOR_SCALE = 512.0
 CANDIDATES = 1.6
 """Times `max_features`: so many of the strongest compete for their place in the photo."""
 
-CLOSE_BY = 0.8
-"""A first look at more than this share of the closest one would not be worth its time."""
+MAX_COARSE_RATIO = 0.8
+"""Coarse detection at more than this ratio of the finest size would not be worth its time."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class SiftOptions:
     """More give no better poses on textured photos, and matching costs their square."""
     max_image_size: int = 1600
     """Photos whose longer side has more pixels are reduced to this before detection."""
-    first_look: float = 0.65
-    """Share of `max_image_size` at which photos are looked at first: less than half the time, and poses as exact."""
-    enough: float = 0.6
-    """Share of `max_features` at which there is no closer look."""
+    coarse_ratio: float = 0.65
+    """Ratio of `max_image_size` at which features are detected first: less than half the time, and poses as exact."""
+    enough_ratio: float = 0.6
+    """Ratio of `max_features` from which on there is no finer detection."""
     contrast_threshold: float = 0.02
     """Least contrast of a feature, times 3 and relative to the full range of grey levels."""
     edge_threshold: float = 10.0
@@ -43,10 +43,10 @@ class SiftOptions:
             raise ValueError(f"max_features must be at least 1, got {self.max_features}")
         if self.max_image_size < 1:
             raise ValueError(f"max_image_size must be at least 1 pixel, got {self.max_image_size}")
-        if not 0 < self.first_look <= 1:
-            raise ValueError(f"first_look must lie in (0, 1], got {self.first_look}")
-        if not 0 <= self.enough <= 1:
-            raise ValueError(f"enough must lie in [0, 1], got {self.enough}")
+        if not 0 < self.coarse_ratio <= 1:
+            raise ValueError(f"coarse_ratio must lie in (0, 1], got {self.coarse_ratio}")
+        if not 0 <= self.enough_ratio <= 1:
+            raise ValueError(f"enough_ratio must lie in [0, 1], got {self.enough_ratio}")
         if not 0 < self.contrast_threshold < 1:
             raise ValueError(f"contrast_threshold must lie in (0, 1), got {self.contrast_threshold}")
         if self.cells_per_axis < 1:
@@ -73,30 +73,30 @@ class Sift:
         """
         height, width = image.shape[:2]
         features = _no_features()
-        for size in self.looks(width, height):
-            features = self.look(reduced_grey(image, size), image, (width, height), keep)
-            if self.enough(features):
+        for size in self.detection_sizes(width, height):
+            features = self.detect(reduced_grey(image, size), image, (width, height), keep)
+            if self.is_enough(features):
                 break
         return features
 
-    def looks(self, width: int, height: int) -> tuple[int, ...]:
-        """Longer side at which a photo is looked at, one after the other until there are `enough` features."""
-        close = min(self.options.max_image_size, max(width, height))
-        first = max(round(self.options.first_look * self.options.max_image_size), 1)
-        return (first, close) if first < CLOSE_BY * close else (close,)
+    def detection_sizes(self, width: int, height: int) -> tuple[int, ...]:
+        """Longer sides of the photo, from coarse to fine, at which features are detected until there are enough."""
+        fine = min(self.options.max_image_size, max(width, height))
+        coarse = max(round(self.options.coarse_ratio * self.options.max_image_size), 1)
+        return (coarse, fine) if coarse < MAX_COARSE_RATIO * fine else (fine,)
 
-    def enough(self, features: Features) -> bool:
-        """Whether a closer look is not worth its time."""
-        return len(features) >= self.options.enough * self.options.max_features
+    def is_enough(self, features: Features) -> bool:
+        """Whether a finer detection is not worth its time."""
+        return len(features) >= self.options.enough_ratio * self.options.max_features
 
-    def look(
+    def detect(
         self,
         grey: UInt8[np.ndarray, "gh gw"],
         image: UInt8[np.ndarray, "ih iw 3"],
         size: tuple[int, int],
         keep: Bool[np.ndarray, "h w"] | None = None,
     ) -> Features:
-        """What one look finds.
+        """Features at one size of the photo.
 
         Args:
             grey: `reduced_grey` of the photo.

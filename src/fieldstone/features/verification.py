@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.robust.focal_voting import FocalVote, vote_focal, vote_focal_of_rotations
 from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
@@ -24,6 +25,7 @@ def verify_pairs(
     options: TwoViewOptions,
     seed: int,
     threads: int,
+    on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """The graph with the geometry and inliers of every pair, for cameras whose focal length is known well enough.
 
@@ -31,8 +33,9 @@ def verify_pairs(
     the seed, i and j alone.
     """
     pairs = sorted(graph.matches)
+    progress = StageProgress(on_progress, "verifying pairs", len(pairs))
     found = two_views_of_pairs(graph, pairs, cameras, camera_of_image, options, seed, threads)
-    return graph.with_two_views(dict(zip(pairs, found, strict=True)))
+    return graph.with_two_views(dict(zip(pairs, progress.each(found), strict=True)))
 
 
 def two_views_of_pairs(

@@ -1,4 +1,9 @@
-"""From a verified match graph to finished models, with nothing that has to be set by hand."""
+"""From a verified match graph to finished models, with nothing that has to be set by hand.
+
+Four steps: `disambiguate` takes out false pairs, `register` places the photos, `finish` calibrates and adjusts each
+sub-model, `to_mapping_run` tells of it. `map_automatic` is the four in a row; where photos can be matched anew,
+`run.map_photos` recovers unregistered ones between the second and the third.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +16,28 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity, with_ambiguity
+from fieldstone.mapping.disambiguation.options import DisambiguationOptions
+from fieldstone.mapping.disambiguation.visual_aliasing import Disambiguation, disambiguate, with_disambiguation
 from fieldstone.mapping.global_mapper import map_global
-from fieldstone.mapping.incremental.checkpoint import GrowthMemory
-from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, collapsed, map_incremental
-from fieldstone.mapping.incremental.recovery import MoreMatches, rescue
+from fieldstone.mapping.incremental.checkpoint import CheckpointStore
+from fieldstone.mapping.incremental.mapper import collapsed, map_incremental
+from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.incremental.registration import verdict_of_pairs
-from fieldstone.mapping.model.calibration import CalibrationStep, growing_step, with_models
+from fieldstone.mapping.incremental.state import SubModel
+from fieldstone.mapping.model.calibration import CalibrationStep, first_step, with_models
 from fieldstone.mapping.model.outliers import drop_outliers
-from fieldstone.mapping.model.refinement import RefinementOptions, adjust, loss_scale, refine_until_stable
+from fieldstone.mapping.model.refinement import (
+    RefinementOptions,
+    adjust_globally,
+    loss_scale,
+    refine_until_stable,
+)
 from fieldstone.mapping.model.uncertainty import model_uncertainty
 from fieldstone.mapping.model.working_model import WorkingModel, record_views, to_reconstruction
-from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, climb
+from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, select_camera_models
 from fieldstone.mapping.textbook import four_poses
-from fieldstone.scene.mapping_run import Drop, MappingRun, StageRecord
+from fieldstone.progress import OnProgress, StageProgress, silent
+from fieldstone.scene.mapping_run import Drop, MappingRun
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 
@@ -33,13 +46,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class AutomaticOptions:
-    """Growing, self-calibration and the last adjustment."""
+    """Disambiguation, registration, self-calibration and the last adjustment."""
 
     mapper: Literal["incremental", "global"] = "incremental"
     """Photo by photo, or all at once."""
-
+    disambiguation: DisambiguationOptions = field(default_factory=DisambiguationOptions)
+    """When pairs are taken for false."""
     incremental: IncrementalOptions = field(default_factory=IncrementalOptions)
+    """Registration of photos and bundle adjustment, for both mappers."""
     self_calibration: SelfCalibrationOptions = field(default_factory=SelfCalibrationOptions)
+    """Which camera model is believed."""
     min_angle_deg: float = 1.5
     """Points of the result have two rays that meet at this angle at least."""
     covariance: bool = False
@@ -51,13 +67,13 @@ class AutomaticOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
-    """One component after its last adjustment."""
+class FinishedModel:
+    """One sub-model after its last adjustment."""
 
     model: WorkingModel
     before: WorkingModel
-    drops: list[Drop]
-    trials: list[CalibrationTrial]
+    drops: tuple[Drop, ...]
+    trials: tuple[CalibrationTrial, ...]
     calibration: tuple[CalibrationStep | None, ...]
     refinement: RefinementOptions
     """Of the last adjustments."""
@@ -70,106 +86,128 @@ def map_automatic(
     known: Bool[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
-    second_look: Sequence[MoreMatches] = (),
-    memory: GrowthMemory | None = None,
+    store: CheckpointStore | None = None,
+    on_progress: OnProgress = silent,
 ) -> MappingRun:
     """Models of all components; the one with most photos is the reconstruction, the others are kept beside it.
 
     Args:
         graph: Verified, see `features.verification`.
         known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
-        second_look: Ways to find more matches for photos that no model takes in, tried in turn.
-        memory: Where growth that was stopped is taken up again.
+        store: Where a registration that was stopped is taken up again.
+        on_progress: Told of registered photos and finished models.
     """
-    resolution = resolve_ambiguity(graph, cameras, camera_of_image)
-    if resolution.left_out.any():
-        second_look = ()  # it would find again what was left out
-    run = _map_components(resolution.graph, cameras, camera_of_image, known, options, seed, second_look, memory)
-    return with_ambiguity(run, resolution)
+    found = disambiguate(graph, cameras, camera_of_image, options.disambiguation)
+    sub_models = register(found.graph, cameras, camera_of_image, known, options, seed, store, on_progress)
+    return finish_all(found, found.graph, sub_models, cameras, camera_of_image, options, seed, on_progress)
 
 
-def _map_components(
+def register(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
     known: Bool[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
-    second_look: Sequence[MoreMatches],
-    memory: GrowthMemory | None,
-) -> MappingRun:
-    """`map_automatic` for a graph whose pairs do not contradict each other."""
-    calibration = [None if known[c] else growing_step(camera) for c, camera in enumerate(cameras)]
+    store: CheckpointStore | None = None,
+    on_progress: OnProgress = silent,
+) -> list[SubModel]:
+    """The sub-models of a graph without false pairs, the one with most photos first; arguments as `map_automatic`."""
+    calibration = [None if known[c] else first_step(camera) for c, camera in enumerate(cameras)]
     start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
-    grown = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, memory)
-    if not grown:
-        verdicts = {name: f"not registered: {verdict_of_pairs(graph, v)}" for v, name in enumerate(graph.names)}
+    return mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, store, on_progress)
+
+
+def finish_all(
+    disambiguation: Disambiguation,
+    graph: MatchGraph,
+    sub_models: Sequence[SubModel],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: AutomaticOptions,
+    seed: int,
+    on_progress: OnProgress = silent,
+) -> MappingRun:
+    """Every sub-model finished, and the run that tells of them.
+
+    Args:
+        graph: The one that the sub-models were registered with.
+        cameras: As given, before anything was refined.
+    """
+    progress = StageProgress(on_progress, "finishing models", len(sub_models))
+    finished = [
+        finish(sub_model, options, np.random.default_rng([seed, k]))
+        for k, sub_model in enumerate(progress.each(sub_models))
+    ]
+    run = to_mapping_run(graph, sub_models, finished, cameras, camera_of_image, options)
+    return with_disambiguation(run, disambiguation, options.disambiguation)
+
+
+def finish(sub_model: SubModel, options: AutomaticOptions, rng: np.random.Generator) -> FinishedModel:
+    """Self-calibration, then adjustment of everything with everything."""
+    incremental, before = options.incremental, sub_model.model
+    limits = incremental.max_error_px, options.min_angle_deg
+    refinement = incremental.refinement.for_noise(loss_scale(before))
+    calibration, trials = select_camera_models(before, sub_model.calibration, refinement, options.self_calibration, rng)
+    model = refine_until_stable(before, refinement, calibration, *limits, bundle=refinement.final, all_points=True)
+    model, drops = drop_outliers(model, "end", *limits)
+    model = adjust_globally(model, refinement, calibration, bundle=refinement.final, points=model.is_point())
+    model, more = drop_outliers(model, "last adjustment", *limits)
+    if collapsed(before, model, incremental):
+        logger.warning("the last adjustment made the model fall apart: it is left as it was registered")
+        return FinishedModel(before, before, (), tuple(trials), sub_model.calibration, incremental.refinement)
+    return FinishedModel(model, before, (*drops, *more), tuple(trials), calibration, refinement)
+
+
+def to_mapping_run(
+    graph: MatchGraph,
+    sub_models: Sequence[SubModel],
+    finished: Sequence[FinishedModel],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: AutomaticOptions,
+) -> MappingRun:
+    """The frozen models, and what is to be told of the first and of every photo."""
+    verdicts = _verdicts(graph, sub_models, [f.model for f in finished])
+    if not finished:
         nothing = WorkingModel.start(tuple(cameras), camera_of_image, Observations.empty())
         return MappingRun(to_reconstruction(nothing, graph), graph, None, (), (), None, verdicts)
-    grown, graph = rescue(grown, graph, second_look, options.incremental, seed, memory)
-    finished = [finish(component, options, np.random.default_rng([seed, k])) for k, component in enumerate(grown)]
-    best = finished[0]
-    records: list[StageRecord] = record_views(best.before, graph.names, "before BA")
-    records += record_views(best.model, graph.names, "after BA")
-    start = grown[0].initial_pair
+    best, first = finished[0], sub_models[0]
+    records = record_views(best.before, graph.names, "before BA") + record_views(best.model, graph.names, "after BA")
+    start_cameras = with_models(cameras, first.calibration)
     uncertainty = model_uncertainty(best.model, best.calibration, best.refinement) if options.covariance else None
-    initial = four_poses(graph, start, start_cameras, camera_of_image)
     return MappingRun(
         to_reconstruction(best.model, graph),
         graph,
-        initial,
+        four_poses(graph, first.initial_pair, start_cameras, camera_of_image),
         tuple(records),
-        tuple(best.drops),
+        best.drops,
         to_reconstruction(best.before, graph),
-        _verdicts(graph, grown, [f.model for f in finished]),
+        verdicts,
         tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
         tuple(_describe(trial) for trial in best.trials) + tuple(_describe_camera(c) for c in best.model.cameras),
         uncertainty,
     )
 
 
-def finish(grown: GrownModel, options: AutomaticOptions, rng: np.random.Generator) -> Finished:
-    """Self-calibration, then adjustment of everything with everything."""
-    incremental = options.incremental
-    refinement = incremental.refinement.for_noise(loss_scale(grown.model))
-    before = grown.model
-    calibration, trials = climb(grown.model, grown.calibration, refinement, options.self_calibration, rng)
-    model = refine_until_stable(
-        grown.model,
-        refinement,
-        calibration,
-        incremental.max_error_px,
-        options.min_angle_deg,
-        bundle=refinement.final,
-        all_points=True,
-    )
-    model, drops = drop_outliers(model, "end", incremental.max_error_px, options.min_angle_deg)
-    model = adjust(model, refinement, calibration, bundle=refinement.final, points=model.is_point())
-    model, more = drop_outliers(model, "last adjustment", incremental.max_error_px, options.min_angle_deg)
-    if collapsed(before, model):
-        logger.warning("the last adjustment made the model fall apart: it is left as it had grown")
-        return Finished(before, before, [], trials, grown.calibration, incremental.refinement)
-    return Finished(model, before, drops + more, trials, calibration, refinement)
-
-
-def _verdicts(graph: MatchGraph, grown: list[GrownModel], models: list[WorkingModel]) -> dict[str, str]:
+def _verdicts(graph: MatchGraph, sub_models: Sequence[SubModel], models: Sequence[WorkingModel]) -> dict[str, str]:
     """For every photo: in which model with how many points, or why in none."""
     out = {}
     for view, name in enumerate(graph.names):
-        home = next((k for k, model in enumerate(models) if model.poses[view] is not None), None)
+        home = next((k for k, model in enumerate(models) if model.registered[view]), None)
         if home is None:
-            tried = [g.failures[view] for g in grown if view in g.failures]
+            tried = [s.failures[view] for s in sub_models if view in s.failures]
             out[name] = f"not registered: {'; '.join([*tried[:1], verdict_of_pairs(graph, view)])}"
         elif home == 0:
-            out[name] = f"registered: {len(models[0].observations_of(view))} points; {grown[0].reasons[view]}"
+            out[name] = f"registered: {len(models[0].observations_of(view))} points; {sub_models[0].reasons[view]}"
         else:
             out[name] = f"in a model of its own ({home + 1} of {len(models)}): {verdict_of_pairs(graph, view)}"
     return out
 
 
 def _describe(trial: CalibrationTrial) -> str:
-    """One line on one step of the ladder."""
+    """One line on one camera model that was tried."""
     verdict = "accepted" if trial.accepted else "refused"
     return (
         f"calibration {trial.step.model} with {', '.join(trial.step.free)} free: held-out observations predicted to "

@@ -13,12 +13,15 @@ from scipy.sparse.csgraph import connected_components
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.mapping.incremental.checkpoint import GrowthMemory
-from fieldstone.mapping.incremental.mapper import LADDER, GrownModel, IncrementalOptions, grow
+from fieldstone.mapping.incremental.checkpoint import CheckpointStore
+from fieldstone.mapping.incremental.mapper import extend
+from fieldstone.mapping.incremental.options import RETRY_STAGES, IncrementalOptions
+from fieldstone.mapping.incremental.state import RegistrationState, RegistrationTask, SubModel, largest_first
 from fieldstone.mapping.model.calibration import CalibrationStep
-from fieldstone.mapping.model.refinement import adjust
+from fieldstone.mapping.model.refinement import adjust_globally
 from fieldstone.mapping.model.triangulation import covering_tracks, plane_coordinates, retriangulate
 from fieldstone.mapping.model.working_model import WorkingModel
+from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.solve.averaging.positions import position_views_and_points
@@ -58,8 +61,9 @@ def map_global(
     calibration: Sequence[CalibrationStep | None],
     options: IncrementalOptions,
     seed: int,
-    memory: GrowthMemory | None = None,
-) -> list[GrownModel]:
+    store: CheckpointStore | None = None,
+    on_progress: OnProgress = silent,
+) -> list[SubModel]:
     """Every component of the graph, the one with most photos first; arguments as `map_incremental`.
 
     Rotations are averaged over the pairs, pairs that contradict them are dropped, and a linear problem gives the
@@ -69,8 +73,9 @@ def map_global(
     Source:
         The order of `pan2024`.
     """
-    free = np.ones(graph.num_images, dtype=bool)
-    grown: list[GrownModel] = []
+    progress = StageProgress(on_progress, "registering photos", graph.num_images)
+    available = np.ones(graph.num_images, dtype=bool)
+    sub_models: list[SubModel] = []
     edges = _edges(graph)
     while len(edges.pairs):
         component = _largest_component(edges.pairs, graph.num_images)
@@ -80,12 +85,17 @@ def map_global(
             edges = edges.where(~inside)
             continue
         model, pair = placed
-        reasons = dict.fromkeys(np.flatnonzero(model.registered_mask()).tolist(), "placed with all others at once")
-        grown.append(grow(model, graph, pair, reasons, free, tuple(calibration), options, seed, memory))
-        free = free & ~grown[-1].model.registered_mask()
-        logger.info("component of %d photos", grown[-1].model.registered_mask().sum())
-        edges = edges.where(np.all(free[edges.pairs], axis=1))
-    return sorted(grown, key=lambda g: -int(g.model.registered_mask().sum()))
+        held = int(np.sum(~available))
+        progress.at(held + model.num_registered)
+        task = RegistrationTask(
+            graph, available, tuple(calibration), options, seed, lambda count, held=held: progress.at(held + count)
+        )
+        reasons = dict.fromkeys(np.flatnonzero(model.registered).tolist(), "placed with all others at once")
+        sub_models.append(extend(RegistrationState.start(model, reasons), pair, task, store))
+        available = available & ~sub_models[-1].model.registered
+        logger.info("sub-model of %d photos", sub_models[-1].num_registered)
+        edges = edges.where(np.all(available[edges.pairs], axis=1))
+    return largest_first(sub_models)
 
 
 def _edges(graph: MatchGraph) -> _Edges:
@@ -133,19 +143,21 @@ def _place(
         return None
     # All matches make the points: those of a dropped pair may be right, and are judged one by one.
     tracks, _ = build_tracks(graph, split_conflicts=True)
-    model = replace(WorkingModel.start(tuple(cameras), camera_of_image, tracks), poses=poses)
-    everything, angle = np.ones(len(model.xyz), dtype=bool), LADDER[0].min_angle_deg
+    views, cam_from_world = poses
+    model = WorkingModel.start(tuple(cameras), camera_of_image, tracks).with_poses(views, cam_from_world)
+    strict = RETRY_STAGES[0]
     for tolerance in TOLERANCES:
         error = tolerance * options.max_error_px
-        model = retriangulate(model, everything, max_error_px=error, min_angle_deg=angle)
-        model = _without_lonely_views(model, LADDER[0].min_inliers)
-        if model.registered_mask().sum() < 2:
+        model = retriangulate(model, model.all_tracks(), max_error_px=error, min_angle_deg=strict.min_angle_deg)
+        model = _without_lonely_views(model, strict.min_inliers)
+        if model.num_registered < 2:
             return None
-        model = adjust(model, options.refinement, (None,) * len(cameras))
-    model = retriangulate(model, everything, max_error_px=options.max_error_px, min_angle_deg=angle)
-    model = _without_lonely_views(model, LADDER[0].min_inliers)
-    registered = model.registered_mask()
-    inside = registered[edges.pairs].all(axis=1)
+        model = adjust_globally(model, options.refinement, (None,) * len(cameras))
+    model = retriangulate(
+        model, model.all_tracks(), max_error_px=options.max_error_px, min_angle_deg=strict.min_angle_deg
+    )
+    model = _without_lonely_views(model, strict.min_inliers)
+    inside = model.registered[edges.pairs].all(axis=1)
     if not inside.any():
         return None
     i, j = edges.pairs[inside][np.argmax(edges.weights[inside])].tolist()
@@ -173,15 +185,14 @@ def _positions(
     rotations: dict[int, Float[np.ndarray, "3 3"]],
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
-) -> tuple[Rigid3 | None, ...] | None:
-    """Poses of the photos that the covering tracks hold; None if there are no such tracks."""
+) -> tuple[Int[np.ndarray, "k"], Rigid3] | None:
+    """The photos that the covering tracks hold and their poses; None if there are no such tracks."""
     tracks, _ = build_tracks(graph, split_conflicts=True)
     model = WorkingModel.start(tuple(cameras), camera_of_image, tracks)
-    turned = tuple(
-        Rigid3(rotations[v], np.zeros(3)) if v in rotations else None for v in range(model.num_views)
-    )  # fmt: skip
+    R = np.array(list(rotations.values()))
+    model = model.with_poses(np.array(list(rotations)), Rigid3(R, np.zeros((len(R), 3))))
     long = np.bincount(tracks.point, minlength=len(model.xyz)) >= MIN_TRACK_LENGTH
-    model = replace(model, poses=turned, xyz=np.where(long[:, None], 0.0, np.full((len(long), 3), np.nan)))
+    model = replace(model, xyz=np.where(long[:, None], 0.0, np.full((len(long), 3), np.nan)))
     rows = model.used_observations()
     rows = rows[covering_tracks(model, TRACKS_PER_VIEW)[tracks.point[rows]]]
     uv = plane_coordinates(model, rows)
@@ -190,20 +201,18 @@ def _positions(
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     if not len(rows):
         return None
-    R = model.stacked_poses().R
+    R = model.cam_from_world.R
     views, view = np.unique(tracks.view[rows], return_inverse=True)
     _, point = np.unique(tracks.point[rows], return_inverse=True)
     in_world = np.einsum("kji,kj->ki", R[tracks.view[rows]], rays)
     if len(views) < 2:
         return None
     centers, _ = position_views_and_points(view, point, in_world)
-    poses: list[Rigid3 | None] = [None] * model.num_views
-    for v, center in zip(views.tolist(), centers, strict=True):
-        poses[v] = Rigid3(R[v], -R[v] @ center)
-    return tuple(poses)
+    t = np.array([-R[v] @ center for v, center in zip(views, centers, strict=True)])
+    return views, Rigid3(R[views], t)
 
 
 def _without_lonely_views(model: WorkingModel, min_points: int) -> WorkingModel:
     """Views that see fewer points lose their pose."""
     seen = np.bincount(model.tracks.view[model.used_observations()], minlength=model.num_views)
-    return replace(model, poses=tuple(pose if seen[v] >= min_points else None for v, pose in enumerate(model.poses)))
+    return model.only_registered(seen >= min_points)

@@ -1,4 +1,4 @@
-"""How rich a camera model the photos support: each step up the ladder must predict observations that it never saw."""
+"""How rich a camera model the photos support: a richer one must predict observations that it never saw."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import image_from_cam
-from fieldstone.mapping.model.calibration import LADDER, CalibrationStep, steps_above
-from fieldstone.mapping.model.refinement import Calibration, RefinementOptions, adjust
+from fieldstone.mapping.model.calibration import CANDIDATE_STEPS, CalibrationStep, richer_steps
+from fieldstone.mapping.model.refinement import Calibration, RefinementOptions, adjust_globally
 from fieldstone.mapping.model.triangulation import covering_tracks, plane_coordinates
 from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.solve.robust.loss import cauchy
@@ -36,12 +36,12 @@ class SelfCalibrationOptions:
     min_judges: int = 100
     """With fewer predictions nothing is decided, and the calibration stays as it is."""
     principal_point: bool = True
-    """Whether steps that move the principal point are on the ladder."""
+    """Whether steps that move the principal point are among the candidates."""
 
 
 @dataclass(frozen=True)
 class CalibrationTrial:
-    """One step of the ladder against the best before it: robust root mean squares of prediction, and the verdict."""
+    """One candidate against the best before it: robust root mean squares of prediction, and the verdict."""
 
     step: CalibrationStep
     rms_before_px: float
@@ -50,18 +50,18 @@ class CalibrationTrial:
     accepted: bool
 
 
-def climb(
+def select_camera_models(
     model: WorkingModel,
     calibration: Calibration,
     refinement: RefinementOptions,
     options: SelfCalibrationOptions,
     rng: np.random.Generator,
 ) -> tuple[tuple[CalibrationStep | None, ...], list[CalibrationTrial]]:
-    """The richest calibration on the ladder that held-out tracks agree to, for all cameras that may be refined.
+    """The richest candidate that held-out tracks agree to, for all cameras that may be refined.
 
     Every step is fitted on the other tracks from the best model so far and judged on the same predictions: each
-    observation of a held-out track from the point that its other observations give. The climb ends after two steps in
-    a row that are not believed; where one radial term did not do, a fisheye lens is tried all the same.
+    observation of a held-out track from the point that its other observations give. The selection ends after two steps
+    in a row that are not believed; where one radial term did not do, a fisheye lens is tried all the same.
 
     Returns:
         The calibration of each camera (None stays None), and every trial.
@@ -74,8 +74,10 @@ def climb(
         return tuple(calibration), []
     learners = covering_tracks(model, refinement.tracks_per_view) & ~judges
     best = tuple(calibration)
-    above = [() if step is None else steps_above(step, principal_point=options.principal_point) for step in calibration]
-    fitted = adjust(model, refinement, best, bundle=refinement.final, points=learners)
+    above = [
+        () if step is None else richer_steps(step, principal_point=options.principal_point) for step in calibration
+    ]
+    fitted = adjust_globally(model, refinement, best, bundle=refinement.final, points=learners)
     loss = cauchy(refinement.final.loss_scale_px)
 
     def badness(model: WorkingModel) -> Float[np.ndarray, "k"]:
@@ -84,12 +86,12 @@ def climb(
     errors = badness(fitted)
     trials: list[CalibrationTrial] = []
     refused = 0
-    for step in LADDER:
+    for step in CANDIDATE_STEPS:
         candidate = tuple(step if old is not None and step in above[c] else old for c, old in enumerate(best))
         of_another_kind = step.model == "OPENCV_FISHEYE" and any(old is not None and "k2" in old.free for old in best)
         if candidate == best or (refused == 2 and not of_another_kind):
             continue
-        richer = adjust(fitted, refinement, candidate, bundle=refinement.final, points=learners)
+        richer = adjust_globally(fitted, refinement, candidate, bundle=refinement.final, points=learners)
         new_errors = badness(richer)
         gain = errors - new_errors
         significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
@@ -135,7 +137,7 @@ def prediction_errors(
     uv = plane_coordinates(model, rows)[predictions.members]
     focal = np.array([model.camera_of(v).focal.mean() for v in range(model.num_views)])
     points, _ = triangulate_robust(
-        model.stacked_poses(),
+        model.cam_from_world,
         focal,
         model.tracks.view[rows[predictions.members]],
         uv,
@@ -145,7 +147,7 @@ def prediction_errors(
     )
     target_rows = rows[predictions.target]
     view = model.tracks.view[target_rows]
-    in_cam = model.stacked_poses()[view].apply(points)
+    in_cam = model.cam_from_world[view].apply(points)
     out = np.empty(len(view))
     for c, camera in enumerate(model.cameras):
         mine = model.camera_of_view[view] == c

@@ -77,7 +77,7 @@ def map_textbook(
         The largest model that grows from the best initial pair. It has no registered photo, and no `initial_pair`,
         if no pair of photos gives a start.
     """
-    graph = verify_pairs(graph, cameras, camera_of_image, options, seed)
+    graph = estimate_essential_matrices(graph, cameras, camera_of_image, options, seed)
     tracks, statistics = build_tracks(graph)
     drops = [Drop("tracks", "two places of one photo in one track", statistics.dropped_conflicting)]
     model = WorkingModel.start(tuple(cameras), camera_of_image, tracks)
@@ -92,10 +92,10 @@ def map_textbook(
     model, dropped = drop_outliers(model, "start", options.max_error_px, options.min_angle_deg)
     drops += dropped
     failures: dict[int, str] = {}
-    while (view := next_view(model, failures)) is not None:
+    while (view := view_with_most_points(model, failures)) is not None:
         if not failures:  # the model has grown since the last adjustment
-            model = adjust(model, options, refine_focal=False)
-        pose, reason, stage_records = register_view(model, graph, view, options, seed)
+            model = adjust_with_scipy(model, options, refine_focal=False)
+        pose, reason, stage_records = resect_view(model, graph, view, options, seed)
         records += stage_records
         if pose is None:
             failures[view] = reason
@@ -117,7 +117,7 @@ def map_textbook(
     return MappingRun(reconstruction, graph, initial, tuple(records), tuple(drops + dropped), before, verdicts)
 
 
-def verify_pairs(
+def estimate_essential_matrices(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
@@ -186,14 +186,14 @@ def four_poses(
     return InitialPair(pair, tuple(candidates), in_front, chosen, points)
 
 
-def next_view(model: WorkingModel, failures: dict[int, str]) -> int | None:
+def view_with_most_points(model: WorkingModel, failures: dict[int, str]) -> int | None:
     """The photo without pose that sees most points of the model; None when none is left to try."""
     seen = model.visible_points_per_view()
-    waiting = [v for v in range(model.num_views) if model.poses[v] is None and v not in failures and seen[v] > 0]
+    waiting = [v for v in np.flatnonzero(~model.registered & (seen > 0)).tolist() if v not in failures]
     return max(waiting, key=lambda v: (seen[v], -v), default=None)
 
 
-def register_view(
+def resect_view(
     model: WorkingModel, graph: MatchGraph, view: int, options: TextbookOptions, seed: int
 ) -> tuple[Rigid3 | None, str, list[StageRecord]]:
     """Pose of one more photo from the points that it sees, with the reprojections of every stage.
@@ -226,9 +226,9 @@ def register_view(
     return pose, f"{int(result.inliers.sum())} of {len(rows)} points agree with one pose", records
 
 
-def adjust(model: WorkingModel, options: TextbookOptions, *, refine_focal: bool) -> WorkingModel:
+def adjust_with_scipy(model: WorkingModel, options: TextbookOptions, *, refine_focal: bool) -> WorkingModel:
     """Bundle adjustment of all poses and points; the first registered view fixes the frame."""
-    registered = [v for v in range(model.num_views) if model.poses[v] is not None]
+    registered = np.flatnonzero(model.registered).tolist()
     rows = model.used_observations()
     used_points, point = np.unique(model.tracks.point[rows], return_inverse=True)
     view = np.searchsorted(registered, model.tracks.view[rows])
@@ -236,7 +236,7 @@ def adjust(model: WorkingModel, options: TextbookOptions, *, refine_focal: bool)
     problem = BundleProblem(
         cameras=model.cameras,
         camera_of_view=model.camera_of_view[registered],
-        cam_from_world=Rigid3.stack([model.pose_of(v) for v in registered]),
+        cam_from_world=model.cam_from_world[registered],
         points=model.xyz[used_points],
         view=view,
         point=point,
@@ -254,7 +254,7 @@ def refine_globally(model: WorkingModel, options: TextbookOptions) -> tuple[Work
     """Rounds of bundle adjustment, dropping what does not fit and recalling what fits again, until nothing changes."""
     drops: list[Drop] = []
     for round_number in range(options.max_rounds):
-        model = adjust(model, options, refine_focal=options.refine_focal)
+        model = adjust_with_scipy(model, options, refine_focal=options.refine_focal)
         before = model.active.copy()
         model = recall_observations(model, options.max_error_px)
         model, dropped = drop_outliers(
@@ -281,7 +281,7 @@ def _verdicts(graph: MatchGraph, model: WorkingModel, failures: dict[int, str]) 
     out, errors = {}, reprojections(model)
     counts = np.bincount(model.tracks.view[errors.rows], minlength=model.num_views)
     for view, name in enumerate(graph.names):
-        if model.poses[view] is not None:
+        if model.registered[view]:
             out[name] = f"registered: {counts[view]} points"
         else:
             out[name] = failures.get(view, "not registered: sees no point of the model")

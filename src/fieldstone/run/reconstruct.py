@@ -7,31 +7,24 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from fieldstone import __version__
-from fieldstone.features.verification import verify_pairs
 from fieldstone.io.course.matching_txt import is_course_folder
 from fieldstone.io.files.cache import Workspace
-from fieldstone.mapping.automatic import map_automatic
-from fieldstone.mapping.disambiguation.ambiguity import resolve_ambiguity
-from fieldstone.mapping.incremental.checkpoint import GrowthMemory
-from fieldstone.mapping.textbook import map_textbook
 from fieldstone.progress import OnProgress, Progress, silent
 from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
 from fieldstone.report.figures import shrunk, thumbnails
 from fieldstone.run.folder import RunFolder
-from fieldstone.run.kept_growth import KeptGrowth
-from fieldstone.run.matching.photos_to_graph import Material, match_photos, read_course
+from fieldstone.run.map_photos import ChosenMapper, map_given_matches, map_photos, map_with_textbook
+from fieldstone.run.mapper_checkpoint import MapperCheckpoints
+from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_course
 from fieldstone.run.reconstruct_options import ReconstructOptions
 from fieldstone.run.scene import Scene, sizes_of, summary_of, write_scene
 from fieldstone.scene.mapping_run import MappingRun, StageRecord
-from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import View
-
-ChosenMapper = Literal["textbook", "incremental", "global"]
 
 HOW_ERRORS_ARE_COUNTED = (
     "Every error is the distance in pixels between an observed keypoint and the reprojection of its point, taken over "
@@ -57,9 +50,9 @@ def reconstruct(
         source: Folder with photos; or with `calibration.txt`, `matching*.txt` and the photos.
         options: None: those that `settings` give.
         keep_in: Folder for the result: `sparse/0` (COLMAP; further models in `sparse/1` and so on), `points.ply`,
-            `run.json`, `report.html`. Features, matches, two-view geometry and the growing model are kept in its `work`
-            as they are found: a run that was stopped goes on from there when it is started again, and ends with the
-            same bytes. None: nothing is written.
+            `run.json`, `report.html`. Features, matches, two-view geometry and the state of the mapper are kept in its
+            `work` as they are found: a run that was stopped goes on from there when it is started again, and ends with
+            the same bytes. None: nothing is written.
         report: Whether to draw figures and page.
         on_progress: Hears how far every stage is.
         settings: Fields of `ReconstructOptions`, where no options are given.
@@ -91,14 +84,14 @@ def reconstruct_into(
     with ThreadPoolExecutor(1) as meanwhile:
         small: list[Future[Mapping[str, np.ndarray]]] = []
 
-        def draw_thumbnails(photos: Material) -> None:
+        def draw_thumbnails(photos: MatchedPhotos) -> None:
             if report:
                 small.append(meanwhile.submit(thumbnails, photos.graph.names, shrunk(photos.photo_of)))
 
         scene = _reconstructed(source, options, cache, on_progress, draw_thumbnails)
     on_progress(Progress("writing"))
     scene = write_scene(scene, out, report=report, small=small[0].result() if small else None)
-    KeptGrowth(cache).forget()
+    MapperCheckpoints(cache).forget()
     return scene
 
 
@@ -107,74 +100,54 @@ def _reconstructed(
     options: ReconstructOptions,
     cache: Workspace,
     on_progress: OnProgress,
-    on_matched: Callable[[Material], None] = lambda photos: None,
+    on_matched: Callable[[MatchedPhotos], None] = lambda photos: None,
 ) -> Scene:
     """The stages, one after the other.
 
     Args:
         on_matched: Is called with the matched photos before they are mapped.
     """
-    photos, mapper = _matched_photos(source, options, cache, on_progress)
+    given = is_course_folder(source)
+    photos = (
+        read_course(source) if given else match_photos(source, options.matching(), options.seed, cache, on_progress)
+    )
     on_matched(photos)
-    on_progress(Progress("mapping", 0, photos.graph.num_images))
     start = time.perf_counter()
-    run = full_size(run_mapper(mapper, photos, options, KeptGrowth(cache)), photos)
+    mapper, run = run_mapper(photos, options, MapperCheckpoints(cache), on_progress, given=given)
+    run = full_size(run, photos)
     seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
     record = run_record(source, mapper, run, photos, options.seed, seconds)
     return Scene(record, run, photos.photo_of, source, options.masks)
 
 
-def _matched_photos(
-    source: Path, options: ReconstructOptions, cache: Workspace, on_progress: OnProgress
-) -> tuple[Material, ChosenMapper]:
-    """What a mapper works on, and the mapper that suits it.
-
-    Photos are matched here; of given matches, the textbook mapper takes the pairs as they are, unless places look
-    alike: it knows of one place only.
-    """
-    matching = options.matching()
-    if not is_course_folder(source):
-        photos = match_photos(source, matching, options.seed, lambda stage: on_progress(Progress(stage)), cache)
-        return photos, "incremental" if options.mapper == "auto" else options.mapper
-    given = read_course(source)
-    if options.mapper == "textbook":
-        return given, "textbook"
-    verified = replace(given, graph=_verified(given, options))
-    if options.mapper == "auto":
-        return (verified, "incremental") if _look_alike(verified) else (given, "textbook")
-    return verified, options.mapper
-
-
 def run_mapper(
-    mapper: ChosenMapper, material: Material, options: ReconstructOptions, memory: GrowthMemory | None = None
-) -> MappingRun:
-    """One of the mappers on the same material."""
-    graph, cameras, camera_of_image = material.graph, material.cameras, material.camera_of_image
-    if mapper == "textbook":
-        textbook = replace(options.tuning.textbook, refine_focal=not material.known.all())
-        return map_textbook(graph, cameras, camera_of_image, textbook, options.seed)
-    automatic = options.mapping(mapper)
-    return map_automatic(
-        graph, cameras, camera_of_image, material.known, automatic, options.seed, material.second_look, memory
-    )
+    photos: MatchedPhotos,
+    options: ReconstructOptions,
+    checkpoints: MapperCheckpoints,
+    on_progress: OnProgress,
+    *,
+    given: bool,
+) -> tuple[ChosenMapper, MappingRun]:
+    """The mapper that was asked for, or that suits the matches, and its run.
+
+    Args:
+        given: The matches were given, without the geometry of pairs.
+    """
+    textbook, seed = options.tuning.textbook, options.seed
+    mapping = options.mapping("global" if options.mapper == "global" else "incremental")
+    if given:
+        return map_given_matches(
+            photos, options.mapper, options.matching(), mapping, textbook, seed, checkpoints, on_progress
+        )
+    if options.mapper == "textbook":
+        return "textbook", map_with_textbook(photos, textbook, seed)
+    return mapping.mapper, map_photos(photos, options.matching(), mapping, seed, checkpoints, on_progress)
 
 
-def _look_alike(verified: Material) -> bool:
-    """Whether pairs of different places match falsely: the textbook mapper knows of one place only."""
-    resolution = resolve_ambiguity(verified.graph, verified.cameras, verified.camera_of_image)
-    return bool(resolution.left_out.any())
-
-
-def _verified(material: Material, options: ReconstructOptions) -> MatchGraph:
-    """Given matches with the geometry of every pair."""
-    matching, cameras, camera_of_image = options.matching(), material.cameras, material.camera_of_image
-    return verify_pairs(material.graph, cameras, camera_of_image, matching.two_view, options.seed, matching.threads)
-
-
-def full_size(run: MappingRun, material: Material) -> MappingRun:
+def full_size(run: MappingRun, matched: MatchedPhotos) -> MappingRun:
     """The run in the pixels of the photos: models, matches and records."""
-    factor = material.pixel_factors()
-    model = material.full_size(run.reconstruction)
+    factor = matched.pixel_factors()
+    model = matched.full_size(run.reconstruction)
     camera_of_image = np.array([view.camera for view in model.views], dtype=np.int64)
     scale = factor[camera_of_image]
 
@@ -188,13 +161,13 @@ def full_size(run: MappingRun, material: Material) -> MappingRun:
         reconstruction=model,
         graph=graph,
         records=tuple(scaled(record) for record in run.records),
-        before_bundle=None if run.before_bundle is None else material.full_size(run.before_bundle),
-        others=tuple(material.full_size(other) for other in run.others),
+        before_bundle=None if run.before_bundle is None else matched.full_size(run.before_bundle),
+        others=tuple(matched.full_size(other) for other in run.others),
     )
 
 
 def run_record(
-    source: Path, mapper: str, run: MappingRun, photos: Material, seed: int, seconds: Mapping[str, float]
+    source: Path, mapper: str, run: MappingRun, photos: MatchedPhotos, seed: int, seconds: Mapping[str, float]
 ) -> RunRecord:
     """What `run.json` tells of a run."""
     model = run.reconstruction
@@ -216,7 +189,7 @@ def run_record(
     )
 
 
-def _verdicts_on_views(run: MappingRun, photos: Material) -> Iterator[PhotoVerdict]:
+def _verdicts_on_views(run: MappingRun, photos: MatchedPhotos) -> Iterator[PhotoVerdict]:
     """Of every photo that was matched."""
     model, uncertainty = run.reconstruction, run.uncertainty
     counts = np.bincount(model.observations.view, minlength=len(model.views))
@@ -233,7 +206,7 @@ def _verdicts_on_views(run: MappingRun, photos: Material) -> Iterator[PhotoVerdi
         )
 
 
-def _verdicts_on_problems(run: MappingRun, photos: Material) -> Iterator[PhotoVerdict]:
+def _verdicts_on_problems(run: MappingRun, photos: MatchedPhotos) -> Iterator[PhotoVerdict]:
     """Of every file that is no photo to work with."""
     for problem in photos.problems:
         if problem.path.name not in run.verdicts:
@@ -242,7 +215,7 @@ def _verdicts_on_problems(run: MappingRun, photos: Material) -> Iterator[PhotoVe
             yield PhotoVerdict(name, registered=False, verdict=f"{problem.kind}: {problem.reason}", points=0)
 
 
-def _sharpness(view: View, photos: Material) -> str:
+def _sharpness(view: View, photos: MatchedPhotos) -> str:
     """For a photo that was not registered: how sharp it is, compared with the others."""
     if view.cam_from_world is not None or view.name not in photos.sharpness:
         return ""

@@ -15,18 +15,12 @@ from jaxtyping import Bool, Float, Int
 
 from fieldstone.geometry.camera import Camera, bearings_from_image, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.mapping.disambiguation.options import MissingOptions
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
-
-GRIDS = ((6, 4, 0.0), (6, 4, 0.5))
-"""Columns, rows and shift in cells of the regions of a photo; two grids, so that no region lies on borders only."""
-MIN_PARALLAX_DEG = 1.0
-"""Rays that meet at a smaller angle tell no depth."""
-MIN_COMMON = 5
-"""Depths that two pairs of a photo share, for the one to give the other its scale."""
 
 
 @dataclass(frozen=True)
-class Conflict:
+class MissingCorrespondences:
     """How much of a pair's common view goes without matches; numbers of features, both directions together."""
 
     missing: int
@@ -52,12 +46,13 @@ class _Neighbor:
     angle: Float[np.ndarray, "m"]
 
 
-def find_conflicts(
+def find_missing_correspondences(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
+    options: MissingOptions,
     wanted: Collection[ImagePair] | None = None,
-) -> dict[ImagePair, Conflict]:
+) -> dict[ImagePair, MissingCorrespondences]:
     """Missing correspondences of every pair that has a relative pose, or of those that are wanted.
 
     The neighbours of each photo are brought to one scale by the depths that they share, which tells where any of the
@@ -78,7 +73,7 @@ def find_conflicts(
     sums: dict[ImagePair, tuple[int, int]] = {}
     angles: dict[ImagePair, float] = {}
     for center, star in enumerate(stars):
-        scales, depths = _one_scale(star, len(graph.keypoints[center]))
+        scales, depths = _one_scale(star, len(graph.keypoints[center]), options)
         known = np.flatnonzero(np.isfinite(depths))
         points = bearings[center][known] * depths[known, None]
         for neighbor, scale in zip(star, scales, strict=True):
@@ -88,17 +83,17 @@ def find_conflicts(
             angles[pair] = float(np.median(neighbor.angle))
             before = sums.setdefault(pair, (0, 0))
             if not np.isfinite(scale):
-                if angles[pair] > np.deg2rad(MIN_PARALLAX_DEG):
+                if angles[pair] > np.deg2rad(options.min_parallax_deg):
                     continue
                 scale = 0.0  # so short a baseline moves nothing
             T = Rigid3(neighbor.from_center.R, scale * neighbor.from_center.t)
             in_neighbor = T.apply(points[~np.isin(known, neighbor.own)])
             missing, expected = _without_matches(
-                own_cameras[view], in_neighbor, graph.keypoints[view], neighbor.other, confirmed[view]
+                own_cameras[view], in_neighbor, graph.keypoints[view], neighbor.other, confirmed[view], options
             )
             sums[pair] = before[0] + missing, before[1] + expected
     inliers = {pair: int(graph.two_views[pair].inliers.sum()) for pair in sums}
-    return {pair: Conflict(*sums[pair], inliers[pair], angles[pair]) for pair in sorted(sums)}
+    return {pair: MissingCorrespondences(*sums[pair], inliers[pair], angles[pair]) for pair in sorted(sums)}
 
 
 def _without_matches(
@@ -107,6 +102,7 @@ def _without_matches(
     keypoints: Float[np.ndarray, "k 2"],
     matched: Int[np.ndarray, "m"],
     confirmed: Bool[np.ndarray, "k"],
+    options: MissingOptions,
 ) -> tuple[int, int]:
     """`missing` and `expected` of one direction, by the cells of the second photo."""
     pixels = image_from_cam(camera, unmatched_in_cam)
@@ -115,15 +111,17 @@ def _without_matches(
         inside = (unmatched_in_cam[:, 2] > 0) & np.all((pixels > 0) & (pixels < size), axis=1)
     alone = confirmed.copy()
     alone[matched] = False
-    both = np.minimum(_per_cell(pixels[inside], size), _per_cell(keypoints[alone], size))
-    with_match = _per_cell(keypoints[matched], size)
+    both = np.minimum(_per_cell(pixels[inside], size, options), _per_cell(keypoints[alone], size, options))
+    with_match = _per_cell(keypoints[matched], size, options)
     return int(both[with_match == 0].sum()), int(both.sum() + with_match.sum())
 
 
-def _per_cell(pixels: Float[np.ndarray, "p 2"], size: Int[np.ndarray, "2"]) -> Int[np.ndarray, "c"]:
+def _per_cell(
+    pixels: Float[np.ndarray, "p 2"], size: Int[np.ndarray, "2"], options: MissingOptions
+) -> Int[np.ndarray, "c"]:
     """Number of pixels in every cell of every grid."""
     counts = []
-    for columns, rows, shift in GRIDS:
+    for columns, rows, shift in options.grids:
         column, row = np.clip((pixels / size * [columns, rows] + shift).astype(np.int64), 0, [columns, rows]).T
         counts.append(np.bincount(column * (rows + 1) + row, minlength=(columns + 1) * (rows + 1)))
     return np.concatenate(counts)
@@ -154,11 +152,13 @@ def _depths(
     return (ab * bt - at) / sine2, (bt - ab * at) / sine2, np.arctan2(np.sqrt(sine2), ab)
 
 
-def _one_scale(star: Sequence[_Neighbor], num_keypoints: int) -> tuple[Float[np.ndarray, "s"], Float[np.ndarray, "k"]]:
+def _one_scale(
+    star: Sequence[_Neighbor], num_keypoints: int, options: MissingOptions
+) -> tuple[Float[np.ndarray, "s"], Float[np.ndarray, "k"]]:
     """Length of every neighbour's baseline and depth of every keypoint, in one unit; nan where nothing tells."""
     log_depth = np.full((len(star), num_keypoints), np.nan)
     for row, neighbor in zip(log_depth, star, strict=True):
-        good = (neighbor.depth > 0) & (neighbor.angle > np.deg2rad(MIN_PARALLAX_DEG))
+        good = (neighbor.depth > 0) & (neighbor.angle > np.deg2rad(options.min_parallax_deg))
         row[neighbor.own[good]] = np.log(neighbor.depth[good])
     has_depth = np.isfinite(log_depth)
     log_scale = np.full(len(star), np.nan)
@@ -170,9 +170,9 @@ def _one_scale(star: Sequence[_Neighbor], num_keypoints: int) -> tuple[Float[np.
         known = _median_of_finite(log_depth[placed] + log_scale[placed, None])
         common = has_depth & np.isfinite(known)
         counts = np.where(placed, 0, common.sum(axis=1))
-        if counts.max() < MIN_COMMON:
+        if counts.max() < options.min_common_depths:
             return np.exp(log_scale), np.exp(known)
-        for s in np.flatnonzero(counts >= max(MIN_COMMON, counts.max() // 2)):
+        for s in np.flatnonzero(counts >= max(options.min_common_depths, counts.max() // 2)):
             log_scale[s] = np.median(known[common[s]] - log_depth[s, common[s]])
 
 

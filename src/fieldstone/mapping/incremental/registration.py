@@ -1,4 +1,4 @@
-"""A pose for one more photo, and the start of a model from a pair."""
+"""The pose of one more photo from the points that it sees, and whether its pairs contradict that pose."""
 
 from __future__ import annotations
 
@@ -6,71 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
-from fieldstone.geometry.camera import plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
-from fieldstone.geometry.triangulation import in_front_of_both, triangulate_linear, triangulation_angles
-from fieldstone.mapping.disambiguation.rotation_forest import AGREE
 from fieldstone.mapping.model.working_model import WorkingModel
-from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
+from fieldstone.scene.match_graph import MatchGraph, TwoView
 from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose
 from fieldstone.solve.robust.ransac import RansacOptions
 
-BEST_START_ANGLE_DEG = 20.0
-"""Wider rays than these make a start no better."""
+MAX_ROTATION_DIFFERENCE = float(np.deg2rad(15.0))
+"""Pairs whose rotation differs by less agree with a pose."""
 MAX_DOUBT = 0.2
 """Larger shares of matches that contradict a model tell of wrong cameras: false pairs were taken out before."""
-ANGLE_SAMPLES = 200
-"""Matches of a pair whose angles are looked at."""
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """A pair to start from: score (higher is better), and how many points at which median angle."""
-
-    pair: ImagePair
-    cam2_from_cam1: Rigid3
-    score: float
-    num_points: int
-    median_angle: float
-
-
-def rank_starts(
-    graph: MatchGraph,
-    model: WorkingModel,
-    usable: Sequence[bool] | np.ndarray,
-    min_angle_deg: float,
-    min_points: int,
-    count: int,
-) -> list[Start]:
-    """The `count` best pairs of usable photos from which a model can start, best first.
-
-    The score is the number of points in front of both cameras times the sine of their median angle, up to
-    BEST_START_ANGLE_DEG: many matches make a stable pose, wide rays make stable points. Pairs are looked at in the
-    order of their inliers, until no other can have a better score.
-    """
-    starts: list[Start] = []
-    inliers = {pair: int(two_view.inliers.sum()) for pair, two_view in graph.two_views.items()}
-    best_sine = np.sin(np.deg2rad(BEST_START_ANGLE_DEG))
-    for pair in sorted(inliers, key=lambda pair: (-inliers[pair], pair)):
-        if len(starts) >= count and inliers[pair] * best_sine < starts[count - 1].score:
-            break
-        two_view = graph.two_views[pair]
-        if two_view.cam2_from_cam1 is None or not (usable[pair[0]] and usable[pair[1]]):
-            continue
-        if two_view.kind not in ("calibrated", "planar") or inliers[pair] < min_points:
-            continue
-        angles, share = _angles(graph, model, pair, two_view.cam2_from_cam1)
-        num_points = int(share * inliers[pair])
-        if num_points < min_points or np.median(angles) < np.deg2rad(min_angle_deg):
-            continue
-        median = float(np.median(angles))
-        score = num_points * np.sin(min(median, np.deg2rad(BEST_START_ANGLE_DEG)))
-        starts.append(Start(pair, two_view.cam2_from_cam1, float(score), num_points, median))
-        starts.sort(key=lambda start: (-start.score, start.pair))
-    return starts[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +61,7 @@ def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_fro
     agree, differ = _agreement(model, graph, view, cam_from_world, partners)
     if differ <= agree:
         return ""
-    registered = np.flatnonzero(model.registered_mask()).tolist()
+    registered = np.flatnonzero(model.registered).tolist()
     of_others = [
         _agreement(model, graph, v, model.pose_of(v), _registered_partners(model, graph, v)) for v in registered
     ]
@@ -127,7 +74,7 @@ def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_fro
 def _registered_partners(model: WorkingModel, graph: MatchGraph, view: int) -> list[int]:
     """Registered photos that a photo has verified matches with."""
     partners = [j if view == i else i for i, j in graph.two_views if view in (i, j)]
-    return [p for p in partners if model.poses[p] is not None and _two_view(graph, view, p).inliers.any()]
+    return [p for p in partners if model.registered[p] and _two_view(graph, view, p).inliers.any()]
 
 
 def _two_view(graph: MatchGraph, a: int, b: int) -> TwoView:
@@ -143,7 +90,7 @@ def _agreement(
         two_view = _two_view(graph, view, partner)
         pose, inliers = two_view.cam2_from_cam1, int(two_view.inliers.sum())
         R = None if pose is None else (pose.R if view > partner else pose.R.T) @ model.pose_of(partner).R
-        if R is None or angle_between(R, cam_from_world.R) < AGREE:
+        if R is None or angle_between(R, cam_from_world.R) < MAX_ROTATION_DIFFERENCE:
             agree += inliers
         else:
             differ += inliers
@@ -164,19 +111,3 @@ def verdict_of_pairs(graph: MatchGraph, view: int) -> str:
     kinds = {two_view.kind for pair, two_view in graph.two_views.items() if view in pair and two_view.inliers.any()}
     turned = ", the camera only turned between its photos: no depth" if kinds == {"panoramic"} else ""
     return f"best partner {best} with {partners[best]} matches that agree, of {features} features{turned}"
-
-
-def _angles(
-    graph: MatchGraph, model: WorkingModel, pair: ImagePair, cam2_from_cam1: Rigid3
-) -> tuple[Float[np.ndarray, "n"], float]:
-    """Triangulation angles of a sample of the pair's inliers, and the share that lies in front of both cameras."""
-    matches = graph.inlier_matches(pair)
-    matches = matches[:: max(1, len(matches) // ANGLE_SAMPLES)]
-    pixels1, pixels2 = graph.matched_pixels(pair, matches)
-    uv1 = plane_from_image(model.camera_of(pair[0]), pixels1)
-    uv2 = plane_from_image(model.camera_of(pair[1]), pixels2)
-    uv = np.stack([uv1, uv2], axis=1)
-    points = triangulate_linear(Rigid3.stack([Rigid3.identity(), cam2_from_cam1]), uv[np.isfinite(uv).all(axis=(1, 2))])
-    ahead = points[in_front_of_both(cam2_from_cam1, points)]
-    angles = triangulation_angles(np.zeros(3), cam2_from_cam1.target_origin_in_source(), ahead)
-    return angles, len(ahead) / max(len(matches), 1)

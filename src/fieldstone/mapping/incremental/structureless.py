@@ -61,7 +61,7 @@ def _partners(model: WorkingModel, graph: MatchGraph, view: int, min_inliers: in
         if view not in (i, j) or two_view.kind != "calibrated" or two_view.cam2_from_cam1 is None:
             continue
         partner, inliers = (j if view == i else i), int(two_view.inliers.sum())
-        if model.poses[partner] is None or inliers < min_inliers:
+        if not model.registered[partner] or inliers < min_inliers:
             continue
         view_from_partner = two_view.cam2_from_cam1 if view == j else two_view.cam2_from_cam1.inverse()
         pose = model.pose_of(partner)

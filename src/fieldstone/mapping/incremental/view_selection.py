@@ -13,19 +13,16 @@ CANDIDATES = 8
 """Photos with most visible points whose spread is looked at."""
 
 
-def next_views(model: WorkingModel, tried: frozenset[int], min_points: int) -> list[int]:
-    """Unregistered photos that see at least `min_points` points, best first; photos in `tried` are left out.
+def next_view(model: WorkingModel, excluded: frozenset[int], min_points: int) -> int | None:
+    """The unregistered photo that sees at least `min_points` points, spread best; None if there is none.
 
-    Only the photos with most points are ranked by spread, which is what costs time; the others follow in the order
-    of their number of points.
+    Only the photos with most points compete by spread, which is what costs time.
     """
     seen = model.visible_points_per_view()
-    waiting = [v for v in range(model.num_views) if model.poses[v] is None and v not in tried and seen[v] >= min_points]
-    waiting.sort(key=lambda v: (-seen[v], v))
-    ranked = [
-        (-spread(model.camera_of(v), model.tracks.pixels[model.observations_of(v)]), v) for v in waiting[:CANDIDATES]
-    ]
-    return [v for _, v in sorted(ranked)] + waiting[CANDIDATES:]
+    waiting = np.flatnonzero(~model.registered & (seen >= min_points)).tolist()
+    waiting = sorted((v for v in waiting if v not in excluded), key=lambda v: (-seen[v], v))[:CANDIDATES]
+    scores = {v: spread(model.camera_of(v), model.tracks.pixels[model.observations_of(v)]) for v in waiting}
+    return min(waiting, key=lambda v: (-scores[v], v), default=None)
 
 
 def spread(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> int:

@@ -33,7 +33,7 @@ class CalibrationStep:
         return np.array([name in self.free for name in CAMERA_MODELS[self.model].param_names])
 
 
-LADDER = (
+CANDIDATE_STEPS = (
     CalibrationStep("SIMPLE_PINHOLE", ("f",)),
     CalibrationStep("SIMPLE_RADIAL", ("f", "k")),
     CalibrationStep("SIMPLE_RADIAL", ("f", "cx", "cy", "k")),
@@ -44,35 +44,35 @@ LADDER = (
 )
 """From one number to the richest models; the last one is of another kind, see `as_model`."""
 
-GROWING = (
+FIRST_STEPS = (
     CalibrationStep("SIMPLE_RADIAL", ("f", "k")),
     CalibrationStep("RADIAL", ("f", "k1", "k2")),
     CalibrationStep("OPENCV", ("fx", "fy", "k1", "k2")),
     CalibrationStep("FULL_OPENCV", ("fx", "fy", "k1", "k2")),
     CalibrationStep("OPENCV_FISHEYE", ("fx", "fy", "k1", "k2")),
 )
-"""What is refined while a model grows, by how much the given camera knows; the other parameters stay as given."""
+"""What is refined while photos are registered, by how much is given of the camera; other parameters stay as given."""
 
 FISHEYE_RADII = 200
 """Radii at which a fisheye model is fitted to another one."""
 
 
-def growing_step(camera: Camera) -> CalibrationStep:
-    """The first of `GROWING` whose model expresses the camera as it is."""
-    return next(step for step in GROWING if _expresses(step.model, camera))
+def first_step(camera: Camera) -> CalibrationStep:
+    """The first of `FIRST_STEPS` whose model expresses the camera as it is."""
+    return next(step for step in FIRST_STEPS if _expresses(step.model, camera))
 
 
-def steps_above(step: CalibrationStep, *, principal_point: bool = True) -> list[CalibrationStep]:
-    """The steps of the ladder that refine more than this one.
+def richer_steps(step: CalibrationStep, *, principal_point: bool = True) -> list[CalibrationStep]:
+    """The candidates that refine more than this one.
 
     Args:
         principal_point: Whether steps that move the principal point are among them.
     """
-    order = [other.model for other in LADDER]
+    order = [other.model for other in CANDIDATE_STEPS]
     at_least = order.index(step.model)
     return [
         other
-        for k, other in enumerate(LADDER)
+        for k, other in enumerate(CANDIDATE_STEPS)
         if k >= at_least and not (other.model == step.model and set(other.free) <= set(step.free))
         if principal_point or "cx" not in other.free
     ]

@@ -1,4 +1,4 @@
-"""Points of a growing model: triangulate new ones, drop observations that do not fit, recall those that fit again."""
+"""Points of a working model: triangulate new ones, drop observations that do not fit, recall those that fit again."""
 
 from __future__ import annotations
 
@@ -24,14 +24,12 @@ def triangulate_new_points(
     Args:
         record: Views whose reprojections of the new points are recorded after each of the two stages.
     """
-    rows = np.flatnonzero(
-        model.active & model.registered_mask()[model.tracks.view] & ~model.is_point()[model.tracks.point]
-    )
+    rows = np.flatnonzero(model.active & model.registered[model.tracks.view] & ~model.is_point()[model.tracks.point])
     is_new = np.bincount(model.tracks.point[rows], minlength=len(model.xyz)) >= 2
     rows = rows[is_new[model.tracks.point[rows]]]
     track_ids, point = np.unique(model.tracks.point[rows], return_inverse=True)
     view, pixels = model.tracks.view[rows], model.tracks.pixels[rows]
-    poses = model.stacked_poses()
+    poses = model.cam_from_world
 
     linear = triangulate_tracks_linear(poses, view, point, plane_coordinates(model, rows), len(track_ids))
     linear[~np.all(np.isfinite(linear), axis=1)] = np.nan
@@ -80,7 +78,7 @@ def drop_outliers(
 def recall_observations(model: WorkingModel, max_error_px: float) -> WorkingModel:
     """Take dropped observations of points back whose reprojection error is small now."""
     candidates = np.flatnonzero(
-        ~model.active & model.registered_mask()[model.tracks.view] & model.is_point()[model.tracks.point]
+        ~model.active & model.registered[model.tracks.view] & model.is_point()[model.tracks.point]
     )
     result = reprojections(model, candidates)
     active = model.active.copy()
@@ -101,7 +99,7 @@ def _largest_angles(model: WorkingModel) -> Float[np.ndarray, "t"]:
     Exact for all pairs of a track; tracks are short in the sets that this mapper is for.
     """
     rows = model.used_observations()
-    centers = model.stacked_poses().target_origin_in_source()
+    centers = model.cam_from_world.target_origin_in_source()
     point = model.tracks.point[rows]
     rays = model.xyz[point] - centers[model.tracks.view[rows]]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

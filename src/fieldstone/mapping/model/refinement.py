@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.mapping.model.calibration import CalibrationStep, priors, with_models
 from fieldstone.mapping.model.triangulation import covering_tracks, retriangulate
 from fieldstone.mapping.model.working_model import WorkingModel, reprojections
@@ -65,7 +64,7 @@ class RefinementOptions:
 Calibration = Sequence[CalibrationStep | None]
 
 
-def adjust(
+def adjust_globally(
     model: WorkingModel,
     options: RefinementOptions,
     calibration: Calibration,
@@ -75,10 +74,10 @@ def adjust(
 ) -> WorkingModel:
     """All poses, the points that cover them (or those of a mask), and the intrinsics that may move."""
     points = covering_tracks(model, options.tracks_per_view) if points is None else points
-    return _solve(model, points, model.registered_mask(), calibration, options, bundle or options.growing)
+    return _solve(model, points, model.registered, calibration, options, bundle or options.growing)
 
 
-def adjust_around(
+def adjust_locally(
     model: WorkingModel, view: int, options: RefinementOptions
 ) -> tuple[WorkingModel, Bool[np.ndarray, "t"]]:
     """A view and the photos that share most points with it, the rest held; also returns the points that moved."""
@@ -89,7 +88,7 @@ def adjust_around(
     shared[view] = shared.max() + 1
     free = np.zeros(model.num_views, dtype=bool)
     free[np.argsort(-shared, kind="stable")[: options.neighbors + 1]] = True
-    free &= model.registered_mask() & (shared > 0)
+    free &= model.registered & (shared > 0)
     touched = np.zeros(len(model.xyz), dtype=bool)
     touched[model.tracks.point[rows[free[model.tracks.view[rows]]]]] = True
     points = covering_tracks(model, options.tracks_per_view, touched)
@@ -108,12 +107,13 @@ def refine_until_stable(
     all_points: bool = False,
 ) -> WorkingModel:
     """Rounds of adjustment and of triangulating everything anew, until hardly an observation changes sides."""
-    everything = np.ones(len(model.xyz), dtype=bool)
-    model = retriangulate(model, everything, max_error_px=max_error_px, min_angle_deg=min_angle_deg)
+    model = retriangulate(model, model.all_tracks(), max_error_px=max_error_px, min_angle_deg=min_angle_deg)
     for _ in range(options.max_rounds):
         before = model.used_observations()
-        model = adjust(model, options, calibration, bundle=bundle, points=model.is_point() if all_points else None)
-        model = retriangulate(model, everything, max_error_px=max_error_px, min_angle_deg=min_angle_deg)
+        model = adjust_globally(
+            model, options, calibration, bundle=bundle, points=model.is_point() if all_points else None
+        )
+        model = retriangulate(model, model.all_tracks(), max_error_px=max_error_px, min_angle_deg=min_angle_deg)
         changed = len(np.setxor1d(before, model.used_observations(), assume_unique=True))
         if changed < 1e-3 * len(before):
             break
@@ -176,7 +176,7 @@ def bundle_problem(
     problem = BundleProblem(
         cameras=model.cameras,
         camera_of_view=camera_of_view,
-        cam_from_world=Rigid3.stack([model.pose_of(v) for v in registered]),
+        cam_from_world=model.cam_from_world[registered],
         points=model.xyz[ids],
         view=np.searchsorted(registered, model.tracks.view[rows]),
         point=point,

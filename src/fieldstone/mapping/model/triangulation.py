@@ -1,4 +1,4 @@
-"""Points of a model that grows fast: tracks triangulated by vote, a covering part of them for bundle adjustment."""
+"""Points of the compiled mappers: tracks triangulated by vote, a covering part of them for bundle adjustment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def retriangulate(
     Observations of registered views that do not agree with their point become inactive, the others active, whatever
     they were before. A track without two that agree, or without parallax, has no point.
     """
-    rows = np.flatnonzero(model.registered_mask()[model.tracks.view] & tracks[model.tracks.point])
+    rows = np.flatnonzero(model.registered[model.tracks.view] & tracks[model.tracks.point])
     uv = plane_coordinates(model, rows)
     valid = np.isfinite(uv[:, 0])  # nan outside the range of the lens model
     active = model.active.copy()
@@ -30,7 +30,7 @@ def retriangulate(
     ids, starts = np.unique(point, return_index=True)
     focal = np.array([model.camera_of(v).focal.mean() for v in range(model.num_views)])
     found, inliers = triangulate_robust(
-        model.stacked_poses(),
+        model.cam_from_world,
         focal,
         model.tracks.view[rows],
         uv,

@@ -29,7 +29,7 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
         ValueError: The model has so many photos that the dense inverse would not fit.
     """
     problem, registered, _ = bundle_problem(
-        model, model.is_point(), model.registered_mask(), calibration, options.min_views_for_intrinsics
+        model, model.is_point(), model.registered, calibration, options.min_views_for_intrinsics
     )
     errors = reprojections(model).errors
     freedoms = 2 * len(errors) - 6 * len(registered) - 3 * len(problem.points) + 7
@@ -64,8 +64,7 @@ def robust_factor(errors_px: Float[np.ndarray, "o"], options: BundleOptions) -> 
 def _of_centers(model: WorkingModel, of_views: Float[np.ndarray, "v 6 6"]) -> Float[np.ndarray, "v"]:
     """Standard deviation of each camera's centre c = -R^T t, which (omega, v) moves by c x omega - v in the world."""
     out = np.full(len(of_views), np.nan)
-    for v, pose in enumerate(model.poses):
-        if pose is not None:
-            J = np.concatenate([skew(pose.target_origin_in_source()), -np.eye(3)], axis=1)
-            out[v] = np.sqrt(np.trace(J @ of_views[v] @ J.T))
+    for v in np.flatnonzero(model.registered).tolist():
+        J = np.concatenate([skew(model.pose_of(v).target_origin_in_source()), -np.eye(3)], axis=1)
+        out[v] = np.sqrt(np.trace(J @ of_views[v] @ J.T))
     return out

@@ -23,7 +23,10 @@ class WorkingModel:
 
     cameras: tuple[Camera, ...]
     camera_of_view: Int[np.ndarray, "v"]
-    poses: tuple[Rigid3 | None, ...]
+    cam_from_world: Rigid3
+    """A batch with the pose of every view, C-contiguous; the identity where none is known."""
+    registered: Bool[np.ndarray, "v"]
+    """Which views have a pose."""
     tracks: Observations
     xyz: Float[np.ndarray, "t 3"]
     active: Bool[np.ndarray, "o"]
@@ -31,16 +34,21 @@ class WorkingModel:
     @staticmethod
     def start(cameras: tuple[Camera, ...], camera_of_view: Int[np.ndarray, "v"], tracks: Observations) -> WorkingModel:
         """No pose and no point yet."""
+        v = len(camera_of_view)
+        no_poses = Rigid3(np.tile(np.eye(3), (v, 1, 1)), np.zeros((v, 3)))
         num_tracks = int(tracks.point[-1]) + 1 if len(tracks) else 0
-        poses: tuple[Rigid3 | None, ...] = (None,) * len(camera_of_view)
-        return WorkingModel(
-            cameras, camera_of_view, poses, tracks, np.full((num_tracks, 3), np.nan), np.ones(len(tracks), dtype=bool)
-        )
+        xyz, active = np.full((num_tracks, 3), np.nan), np.ones(len(tracks), dtype=bool)
+        return WorkingModel(cameras, camera_of_view, no_poses, np.zeros(v, dtype=bool), tracks, xyz, active)
 
     @property
     def num_views(self) -> int:
         """Photos, registered or not."""
-        return len(self.poses)
+        return len(self.registered)
+
+    @property
+    def num_registered(self) -> int:
+        """Photos with a pose."""
+        return int(self.registered.sum())
 
     def camera_of(self, view: int) -> Camera:
         """The camera of a view."""
@@ -48,23 +56,34 @@ class WorkingModel:
 
     def pose_of(self, view: int) -> Rigid3:
         """`cam_from_world` of a registered view."""
-        pose = self.poses[view]
-        assert pose is not None
-        return pose
+        assert self.registered[view]
+        return self.cam_from_world[view]
 
     def with_pose(self, view: int, cam_from_world: Rigid3) -> WorkingModel:
-        """The model with one more registered view."""
-        poses = list(self.poses)
-        poses[view] = cam_from_world
-        return replace(self, poses=tuple(poses))
+        """The model with one view registered."""
+        return self.with_poses(np.array([view]), Rigid3.stack([cam_from_world]))
 
-    def registered_mask(self) -> Bool[np.ndarray, "v"]:
-        """Which views have a pose."""
-        return np.array([pose is not None for pose in self.poses], dtype=bool)
+    def with_poses(self, views: Int[np.ndarray, "k"], cam_from_world: Rigid3) -> WorkingModel:
+        """The model with these views registered, by a batch of poses."""
+        R, t, registered = self.cam_from_world.R.copy(), self.cam_from_world.t.copy(), self.registered.copy()
+        R[views], t[views], registered[views] = cam_from_world.R, cam_from_world.t, True
+        return replace(self, cam_from_world=Rigid3(R, t), registered=registered)
 
-    def stacked_poses(self) -> Rigid3:
-        """All poses as a batch; identity where there is none."""
-        return Rigid3.stack([Rigid3.identity() if pose is None else pose for pose in self.poses])
+    def only_registered(self, keep: Bool[np.ndarray, "v"]) -> WorkingModel:
+        """The model in which views outside a mask have lost their pose."""
+        registered = self.registered & keep
+        R = np.where(registered[:, None, None], self.cam_from_world.R, np.eye(3))
+        t = np.where(registered[:, None], self.cam_from_world.t, 0.0)
+        return replace(self, cam_from_world=Rigid3(R, t), registered=registered)
+
+    def on_tracks(self, tracks: Observations) -> WorkingModel:
+        """The same cameras and poses, without a point yet, on other tracks."""
+        start = WorkingModel.start(self.cameras, self.camera_of_view, tracks)
+        return replace(start, cam_from_world=self.cam_from_world, registered=self.registered)
+
+    def all_tracks(self) -> Bool[np.ndarray, "t"]:
+        """A mask of all tracks, whether they have a point or not."""
+        return np.ones(len(self.xyz), dtype=bool)
 
     def is_point(self) -> Bool[np.ndarray, "t"]:
         """Which tracks have a position."""
@@ -72,9 +91,7 @@ class WorkingModel:
 
     def used_observations(self) -> Int[np.ndarray, "u"]:
         """Active observations of points by registered views."""
-        return np.flatnonzero(
-            self.active & self.registered_mask()[self.tracks.view] & self.is_point()[self.tracks.point]
-        )
+        return np.flatnonzero(self.active & self.registered[self.tracks.view] & self.is_point()[self.tracks.point])
 
     def observations_of(self, view: int) -> Int[np.ndarray, "u"]:
         """Active observations of points by one view, registered or not."""
@@ -89,10 +106,7 @@ class WorkingModel:
         """The model with the cameras, poses and points of an adjusted problem."""
         xyz = self.xyz.copy()
         xyz[points] = problem.points
-        model = replace(self, cameras=problem.cameras, xyz=xyz)
-        for k, view in enumerate(views):
-            model = model.with_pose(view, problem.cam_from_world[k])
-        return model
+        return replace(self, cameras=problem.cameras, xyz=xyz).with_poses(np.asarray(views), problem.cam_from_world)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +123,7 @@ def reprojections(model: WorkingModel, rows: Int[np.ndarray, "u"] | None = None)
     if rows is None:
         rows = model.used_observations()
     view, point = model.tracks.view[rows], model.tracks.point[rows]
-    in_cam = model.stacked_poses()[view].apply(model.xyz[point])
+    in_cam = model.cam_from_world[view].apply(model.xyz[point])
     pixels = np.empty((len(rows), 2))
     for c, camera in enumerate(model.cameras):
         mine = model.camera_of_view[view] == c
@@ -130,7 +144,7 @@ def record_views(
     view, point = model.tracks.view[result.rows], model.tracks.point[result.rows]
     chosen = np.ones(len(view), dtype=bool) if points is None else points[point]
     records = []
-    for v in np.flatnonzero(model.registered_mask()).tolist() if views is None else views:
+    for v in np.flatnonzero(model.registered).tolist() if views is None else views:
         mine = (view == v) & chosen
         pixels = model.tracks.pixels[result.rows[mine]]
         records.append(StageRecord(stage, v, names[v], pixels, result.pixels[mine]))
@@ -152,5 +166,8 @@ def to_reconstruction(model: WorkingModel, graph: MatchGraph) -> Reconstruction:
         np.add.at(sums, observations.point[mine], graph.colors[v][observations.keypoint[mine]])
     lengths = np.bincount(observations.point, minlength=len(sums))
     rgb = np.round(sums / np.maximum(lengths, 1)[:, None]).astype(np.uint8)
-    views = tuple(View(name, int(model.camera_of_view[v]), model.poses[v]) for v, name in enumerate(graph.names))
+    views = tuple(
+        View(name, int(model.camera_of_view[v]), model.pose_of(v) if model.registered[v] else None)
+        for v, name in enumerate(graph.names)
+    )
     return Reconstruction(model.cameras, views, Points(model.xyz[is_seen], rgb), observations)

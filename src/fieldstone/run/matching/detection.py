@@ -18,6 +18,7 @@ from fieldstone.io.files.cache import Unit, Workspace, code_version, file_hash, 
 from fieldstone.io.files.names import name_problem
 from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
 from fieldstone.io.images.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
+from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.features import Features
 
@@ -25,7 +26,7 @@ STAGE = "features"
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPhoto:
+class DetectedPhoto:
     """A photo whose features are known; its pixels are not kept."""
 
     info: PhotoInfo
@@ -44,8 +45,11 @@ class SeenPhoto:
 
 
 def detect(
-    paths: Sequence[Path], options: MatchingOptions, workspace: Workspace
-) -> tuple[list[SeenPhoto], list[PhotoProblem]]:
+    paths: Sequence[Path],
+    options: MatchingOptions,
+    workspace: Workspace,
+    on_progress: OnProgress = silent,
+) -> tuple[list[DetectedPhoto], list[PhotoProblem]]:
     """Features of every readable photo, in the order of the paths, and the files that are not used.
 
     Of several photos with the same content only the first is used: the others would count its observations twice.
@@ -57,7 +61,7 @@ def detect(
     extractor = Sift(options.sift)
     masks = {} if options.masks is None else find_masks(options.masks, paths)
 
-    def one(path: Path) -> SeenPhoto | PhotoProblem:
+    def one(path: Path) -> DetectedPhoto | PhotoProblem:
         mask = masks.get(path)
         bad_name = name_problem(path.name)
         if bad_name is not None:
@@ -67,29 +71,30 @@ def detect(
             key = key_of(STAGE, code_version(), cv2.__version__, hashes, options.sift)
             unit = workspace.find(STAGE, key)
             if unit is not None:
-                return SeenPhoto(read_photo_info(path), Features(**unit.arrays), key, mask=mask, **unit.facts)
+                return DetectedPhoto(read_photo_info(path), Features(**unit.arrays), key, mask=mask, **unit.facts)
             info = read_photo_info(path)
         except InputError as error:
             return _unusable(path, error)
         keep = None if mask is None else read_mask(mask, info)
         try:
-            features, sharp = _seen(extractor, info, keep)
+            features, sharp = _coarse_to_fine(extractor, info, keep)
         except InputError as error:
             return _unusable(path, error)
         facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
         arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
         workspace.keep(STAGE, key, Unit(arrays, facts))
-        return SeenPhoto(info, features, key, mask=mask, **facts)
+        return DetectedPhoto(info, features, key, mask=mask, **facts)
 
+    progress = StageProgress(on_progress, "finding features", len(paths))
     # A photo for each thread, until there are fewer photos than threads.
     together = len(paths) - len(paths) % options.threads
     with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
-        results = list(pool.map(one, paths[:together]))
+        results = list(progress.each(pool.map(one, paths[:together])))
     with opencv_threads(options.threads):
-        results += [one(path) for path in paths[together:]]
+        results += list(progress.each(map(one, paths[together:])))
     problems = [result for result in results if isinstance(result, PhotoProblem)]
-    first: dict[str, SeenPhoto] = {}
-    for photo in (result for result in results if isinstance(result, SeenPhoto)):
+    first: dict[str, DetectedPhoto] = {}
+    for photo in (result for result in results if isinstance(result, DetectedPhoto)):
         if photo.key in first:
             reason = f"duplicate of {first[photo.key].info.path.name}, byte for byte"
             problems.append(PhotoProblem(photo.info.path, reason, "not used"))
@@ -105,19 +110,19 @@ def _unusable(path: Path, error: InputError) -> PhotoProblem:
     return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
 
 
-def _seen(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None) -> tuple[Features, float]:
-    """Features of a photo, and its sharpness at the first look; it is decoded no larger than each look needs."""
+def _coarse_to_fine(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None) -> tuple[Features, float]:
+    """Features of a photo, and its sharpness at the coarse size; it is decoded no larger than each size needs."""
 
-    def look(size: int) -> tuple[Features, float]:
+    def detect_at(size: int) -> tuple[Features, float]:
         image = read_photo(info.path, at_least_px=size).rgb
         grey = reduced_grey(image, size)
-        return extractor.look(grey, image, (info.width, info.height), keep), sharpness(grey)
+        return extractor.detect(grey, image, (info.width, info.height), keep), sharpness(grey)
 
-    first, *closer = extractor.looks(info.width, info.height)
-    features, sharp = look(first)
-    for size in closer:
-        if not extractor.enough(features):
-            features, _ = look(size)
+    coarse, *finer = extractor.detection_sizes(info.width, info.height)
+    features, sharp = detect_at(coarse)
+    for size in finer:
+        if not extractor.is_enough(features):
+            features, _ = detect_at(size)
     return features, sharp
 
 

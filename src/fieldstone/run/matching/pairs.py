@@ -13,17 +13,19 @@ from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.cache import Packing, Unit, Workspace, code_version, key_of, resumed
-from fieldstone.run.matching.detection import SeenPhoto
+from fieldstone.progress import OnProgress, StageProgress, silent
+from fieldstone.run.matching.detection import DetectedPhoto
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 
 
 def match_pairs(
-    photos: Sequence[SeenPhoto],
+    photos: Sequence[DetectedPhoto],
     keypoints: Sequence[Float[np.ndarray, "_ 2"]],
     pairs: Sequence[ImagePair],
     options: MatchingOptions,
     workspace: Workspace,
+    on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """Putative matches of the pairs, in their order; pairs without any are left out.
 
@@ -31,10 +33,13 @@ def match_pairs(
         keypoints: Of every photo, in working pixels.
     """
     matcher = MutualRatio(options.max_ratio)
+    progress = StageProgress(on_progress, "matching", len(pairs))
 
     def work(some: Sequence[ImagePair]) -> Iterator[Int[np.ndarray, "_ 2"]]:
+        progress.at(len(pairs) - len(some))  # the others are kept from an earlier run
         with ThreadPoolExecutor(options.threads) as pool:
-            yield from pool.map(lambda pair: matcher(photos[pair[0]].features, photos[pair[1]].features), some)
+            matches = pool.map(lambda pair: matcher(photos[pair[0]].features, photos[pair[1]].features), some)
+            yield from progress.each(matches)
 
     keys = [key_of(code_version(), photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
     packing = Packing(lambda rows: Unit({"rows": rows}), lambda unit: unit.arrays["rows"])
@@ -49,18 +54,22 @@ def match_pairs(
 
 def verify(
     graph: MatchGraph,
-    photos: Sequence[SeenPhoto],
+    photos: Sequence[DetectedPhoto],
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
     options: MatchingOptions,
     seed: int,
     workspace: Workspace,
+    on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """The graph with the geometry of every pair, see `features.verification.verify_pairs`."""
     pairs = sorted(graph.matches)
+    progress = StageProgress(on_progress, "verifying pairs", len(pairs))
 
     def work(some: Sequence[ImagePair]) -> Iterator[TwoView]:
-        return two_views_of_pairs(graph, some, cameras, camera_of_image, options.two_view, seed, options.threads)
+        progress.at(len(pairs) - len(some))
+        found = two_views_of_pairs(graph, some, cameras, camera_of_image, options.two_view, seed, options.threads)
+        return progress.each(found)
 
     def key(pair: ImagePair) -> str:
         used = [cameras[camera_of_image[k]] for k in pair]

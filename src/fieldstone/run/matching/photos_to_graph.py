@@ -18,26 +18,24 @@ from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.io.course.matching_txt import read_course_folder
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
-from fieldstone.mapping.incremental.recovery import MoreMatches
+from fieldstone.progress import OnProgress, silent
 from fieldstone.report.raster import DRAWN_PX
-from fieldstone.run.matching.detection import detect
+from fieldstone.run.matching.detection import DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.pairs import match_pairs, verify
 from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
-from fieldstone.run.matching.recovery import SecondLook
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
 
-OnStage = Callable[[str], None]
 PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
 """Decodes the photo of that name, large enough for figures; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
-    """A graph, its cameras, and the photos behind it.
+class MatchedPhotos:
+    """A correspondence graph with cameras, and the photos behind it.
 
     The graph and the cameras are in working pixels: those of the photos as reduced for matching. `full_size` brings a
     reconstruction back to the pixels of the photos.
@@ -53,8 +51,8 @@ class Material:
     seconds: Mapping[str, float]
     sizes: tuple[tuple[int, int], ...]
     """(width, height) of the photo behind each camera."""
-    second_look: tuple[MoreMatches, ...] = ()
-    """Ways to find more matches for photos that no model takes in."""
+    photos: tuple[DetectedPhoto, ...] = ()
+    """Photos with their features; none where the matches were given."""
     sharpness: Mapping[str, float] = field(default_factory=dict)
     """Of photos by name, see `detection.sharpness`."""
     notes: Sequence[str] = ()
@@ -72,12 +70,12 @@ class Material:
         return np.array([[w / c.width, h / c.height] for c, (w, h) in zip(self.cameras, self.sizes, strict=True)])
 
 
-def read_course(folder: Path) -> Material:
+def read_course(folder: Path) -> MatchedPhotos:
     """Given matches and calibration, and the photos for colours and figures where they are there."""
     start = time.perf_counter()
     course = read_course_folder(folder)
     camera = course.camera
-    return Material(
+    return MatchedPhotos(
         graph=course.graph,
         cameras=(camera,),
         camera_of_image=np.zeros(course.graph.num_images, dtype=np.int64),
@@ -90,16 +88,15 @@ def read_course(folder: Path) -> Material:
 
 
 def match_photos(
-    folder: Path, options: MatchingOptions, seed: int, on_stage: OnStage, workspace: Workspace
-) -> Material:
+    folder: Path, options: MatchingOptions, seed: int, workspace: Workspace, on_progress: OnProgress = silent
+) -> MatchedPhotos:
     """Features of every photo, matches of every pair, focal lengths where nobody knows them, two-view geometry.
 
     Raises:
         InputError: Fewer than two photos can be read.
     """
-    on_stage("finding features")
     stop, seconds = _stopwatch()
-    photos, problems = detect(list_photos(folder), options, workspace)
+    photos, problems = detect(list_photos(folder), options, workspace, on_progress)
     for problem in problems:
         logger.warning("skipped %r: %s", problem.path.name, problem.reason)
     if len(photos) < 2:
@@ -110,7 +107,6 @@ def match_photos(
         )
     infos, features = [photo.info for photo in photos], [photo.features for photo in photos]
     stop("features")
-    on_stage("matching")
     cameras, camera_of_image, source = cameras_of_photos(infos, options)
     sizes = tuple((camera.width, camera.height) for camera in cameras)
     working = tuple(reduced_camera(camera, options.sift.max_image_size) for camera in cameras)
@@ -125,18 +121,26 @@ def match_photos(
         positions=gps_positions(infos),
         threads=options.threads,
     )
-    graph = match_pairs(photos, keypoints, pairs, options, workspace)
+    graph = match_pairs(photos, keypoints, pairs, options, workspace, on_progress)
     stop("matching")
-    on_stage("verifying pairs")
     working, notes = vote_on_focal(graph, working, camera_of_image, source, options, seed)
-    graph = verify(graph, photos, working, camera_of_image, options, seed, workspace)
+    graph = verify(graph, photos, working, camera_of_image, options, seed, workspace, on_progress)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
-    attempts = SecondLook(photos, camera_of_image, options, seed).attempts()
     sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
-    return Material(
-        graph, working, camera_of_image, known, photo_of, tuple(problems), seconds, sizes, attempts, sharpness, notes
+    return MatchedPhotos(
+        graph,
+        working,
+        camera_of_image,
+        known,
+        photo_of,
+        tuple(problems),
+        seconds,
+        sizes,
+        tuple(photos),
+        sharpness,
+        notes,
     )
 
 

@@ -1,4 +1,4 @@
-"""States of growing models on disk."""
+"""Checkpoints of the mapper on disk."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from fieldstone.io.files.cache import Unit, Workspace, code_version, key_of
 
-STAGE = "growth"
+STAGE = "mapper"
 
 
 @dataclass(frozen=True)
-class KeptGrowth:
-    """A `mapping.incremental.checkpoint.GrowthMemory` over the workspace of a run."""
+class MapperCheckpoints:
+    """A `mapping.incremental.checkpoint.CheckpointStore` over the workspace of a run."""
 
     workspace: Workspace
 

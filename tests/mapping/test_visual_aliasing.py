@@ -8,10 +8,10 @@ from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.disambiguation import ambiguity
-from fieldstone.mapping.disambiguation.ambiguity import contradictions, pairs_with_rotation, resolve_ambiguity
-from fieldstone.mapping.disambiguation.missing_correspondences import find_conflicts
-from fieldstone.mapping.disambiguation.rotation_forest import tree_of_most_inliers
+from fieldstone.mapping.disambiguation.missing_correspondences import find_missing_correspondences
+from fieldstone.mapping.disambiguation.options import DisambiguationOptions, MissingOptions
+from fieldstone.mapping.disambiguation.rotation_forest import maximum_spanning_forest
+from fieldstone.mapping.disambiguation.visual_aliasing import contradictions, disambiguate, pairs_with_rotation
 from fieldstone.mapping.incremental.registration import contradicts_pairs
 from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.mapping_run import MappingRun
@@ -28,8 +28,11 @@ def ring(seed: int = 0, **options) -> tuple[SymmetricScene, MatchGraph]:
     return scene, verify_pairs(scene.graph, scene.truth.cameras, one_camera, TwoViewOptions(), seed, 2)
 
 
-def resolve(scene: SymmetricScene, graph: MatchGraph):
-    return resolve_ambiguity(graph, scene.truth.cameras, np.zeros(graph.num_images, dtype=np.int64))
+DEFAULT = DisambiguationOptions()
+
+
+def resolve(scene: SymmetricScene, graph: MatchGraph, options: DisambiguationOptions = DEFAULT):
+    return disambiguate(graph, scene.truth.cameras, np.zeros(graph.num_images, dtype=np.int64), options)
 
 
 def map_ring(scene: SymmetricScene, graph: MatchGraph) -> MappingRun:
@@ -129,15 +132,15 @@ def test_an_ordinary_ring_is_left_alone():
     resolution = resolve(scene, graph)
     assert resolution.graph is graph
     assert resolution.notes == ()
-    assert contradictions(pairs_with_rotation(graph), tree_of_most_inliers(pairs_with_rotation(graph), 28))[0] == 0
+    pairs = pairs_with_rotation(graph, DEFAULT)
+    assert contradictions(pairs, maximum_spanning_forest(pairs, 28), DEFAULT.forest)[0] == 0
 
 
-def test_an_ordinary_ring_loses_no_pair_even_if_it_is_suspected(monkeypatch):
-    monkeypatch.setattr(ambiguity, "CONTRADICTING_PAIRS", 0)
-    monkeypatch.setattr(ambiguity, "CONTRADICTING_SHARE", 0.0)
+def test_an_ordinary_ring_loses_no_pair_even_if_it_is_suspected():
+    suspicious = DisambiguationOptions(min_contradicting_pairs=0, min_contradicting_ratio=0.0)
     scene, graph = ring(sides_differ=True)
-    strong = pairs_with_rotation(graph)
-    kept = agreeing_pairs(resolve(scene, graph).graph)
+    strong = pairs_with_rotation(graph, DEFAULT)
+    kept = agreeing_pairs(resolve(scene, graph, suspicious).graph)
     assert {strong.pair(k) for k in np.flatnonzero(strong.strong).tolist()} <= kept
     # Of the weakest pairs, seen from 40 degrees apart, a few have a wrong rotation of their own.
     wrong = agreeing_pairs(graph) - kept
@@ -158,11 +161,11 @@ def test_a_result_does_not_depend_on_the_order_of_the_pairs():
 
 def test_false_pairs_miss_more_than_true_ones():
     scene, graph = ring(unique_share=0.1)
-    found = find_conflicts(graph, scene.truth.cameras, np.zeros(28, dtype=np.int64))
+    found = find_missing_correspondences(graph, scene.truth.cameras, np.zeros(28, dtype=np.int64), MissingOptions())
     rates: dict[bool, list[float]] = {True: [], False: []}
-    for pair, conflict in found.items():
-        if conflict.angle < np.deg2rad(25) and conflict.inliers > 100 and conflict.expected > 0:
-            rates[scene.is_true(pair)].append(conflict.missing / conflict.expected)
+    for pair, counts in found.items():
+        if counts.angle < np.deg2rad(25) and counts.inliers > 100 and counts.expected > 0:
+            rates[scene.is_true(pair)].append(counts.missing / counts.expected)
     assert max(np.quantile(rates[True], 0.9), 0.005) < np.quantile(rates[False], 0.1)
 
 

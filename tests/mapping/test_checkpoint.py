@@ -1,4 +1,4 @@
-"""Growth that is stopped goes on where it was, and ends the same."""
+"""A registration that is stopped goes on where it was, and ends the same."""
 
 from dataclasses import replace
 
@@ -7,9 +7,11 @@ import pytest
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.io.files.cache import Workspace
-from fieldstone.mapping.incremental.mapper import GrownModel, IncrementalOptions, map_incremental
+from fieldstone.mapping.incremental.mapper import map_incremental
+from fieldstone.mapping.incremental.options import IncrementalOptions
+from fieldstone.mapping.incremental.state import SubModel
 from fieldstone.mapping.model.calibration import CalibrationStep, as_model
-from fieldstone.run.kept_growth import KeptGrowth
+from fieldstone.run.mapper_checkpoint import MapperCheckpoints
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 
 STARTING_STEP = CalibrationStep("SIMPLE_RADIAL", ("f", "k"))
@@ -21,7 +23,7 @@ class Stopped(Exception):
     """In place of a killed process."""
 
 
-class Fragile(KeptGrowth):
+class Fragile(MapperCheckpoints):
     """Stops the run once so many states were kept."""
 
     def keep(self, name, arrays, facts):
@@ -40,42 +42,42 @@ def scene():
     return synthesize(options, np.random.default_rng(2))
 
 
-def grow(scene, memory=None, seed: int = 0, threads: int = 1) -> list[GrownModel]:
+def register(scene, store=None, seed: int = 0, threads: int = 1) -> list[SubModel]:
     camera = as_model(CAMERA, STARTING_STEP.model)
     options = IncrementalOptions().with_threads(threads)
-    return map_incremental(scene.verified_graph(), [camera], ONE_CAMERA, [STARTING_STEP], options, seed, memory)
+    return map_incremental(scene.verified_graph(), [camera], ONE_CAMERA, [STARTING_STEP], options, seed, store)
 
 
-def bits(grown: list[GrownModel]) -> list:
+def bits(sub_models: list[SubModel]) -> list:
     out = []
-    for g in grown:
-        poses = g.model.stacked_poses()
+    for g in sub_models:
+        poses = g.model.cam_from_world
         arrays = (poses.R, poses.t, g.model.xyz, g.model.active, g.model.cameras[0].params)
         out.append(([a.tobytes() for a in arrays], g.reasons, g.failures, g.initial_pair))
     return out
 
 
-def test_growth_goes_on_to_the_same_bits(scene, tmp_path):
-    whole = bits(grow(scene))
-    memory = Fragile(Workspace(tmp_path))
+def test_registration_goes_on_to_the_same_bits(scene, tmp_path):
+    whole = bits(register(scene))
+    store = Fragile(Workspace(tmp_path))
     for _ in range(2):
         with pytest.raises(Stopped):
-            grow(scene, memory)
-    assert bits(grow(scene, memory, threads=2)) == whole
+            register(scene, store)
+    assert bits(register(scene, store, threads=2)) == whole
     total = int((tmp_path / "count").read_text())
-    whole_memory = KeptGrowth(Workspace(tmp_path / "whole"))
-    assert bits(grow(scene, whole_memory)) == whole
+    whole_store = MapperCheckpoints(Workspace(tmp_path / "whole"))
+    assert bits(register(scene, whole_store)) == whole
     assert total <= 9  # two of them made, and none made twice
-    memory.forget()
-    assert not list(tmp_path.glob("growth/*"))
+    store.forget()
+    assert not list(tmp_path.glob("mapper/*"))
 
 
 def test_another_seed_or_graph_finds_nothing(scene, tmp_path):
-    memory = KeptGrowth(Workspace(tmp_path))
-    grow(scene, memory)
-    names = {path.stem for path in tmp_path.glob("growth/*")}
-    grow(scene, memory, seed=1)
+    store = MapperCheckpoints(Workspace(tmp_path))
+    register(scene, store)
+    names = {path.stem for path in tmp_path.glob("mapper/*")}
+    register(scene, store, seed=1)
     noisier = replace(scene, graph=replace(scene.graph, keypoints=tuple(k + 0.25 for k in scene.graph.keypoints)))
-    grow(noisier, memory)
+    register(noisier, store)
     assert len(names) == 1
-    assert len({path.stem for path in tmp_path.glob("growth/*")}) == 3
+    assert len({path.stem for path in tmp_path.glob("mapper/*")}) == 3
