@@ -6,11 +6,15 @@ import pytest
 from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
+from fieldstone.mapping.incremental.options import IncrementalOptions
+from fieldstone.mapping.model import refinement
+from fieldstone.mapping.model.refinement import RefinementOptions
 from fieldstone.mapping.model.triangulation import covering_tracks, retriangulate
 from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.mapping.self_calibration import _leave_one_out, prediction_errors
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import build_tracks
+from fieldstone.solve.bundle.adjustment import bundle_adjust
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from matchers import assert_reconstruction_near
@@ -65,17 +69,41 @@ def test_unknown_cameras_are_calibrated_by_their_own_photos():
     assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.3, relative_distance=0.005)
 
 
-def test_result_is_the_same_for_any_number_of_threads():
+def test_result_is_the_same_for_any_number_of_threads(monkeypatch):
     scene = scene_of(outlier_share=0.2)
-    camera_of_image = np.zeros(8, dtype=np.int64)
-    runs = []
+    camera_of_image, known = np.zeros(8, dtype=np.int64), np.array([False])
+    refinement_options = RefinementOptions(min_observations_for_threads=0)
+    options = AutomaticOptions(incremental=IncrementalOptions(refinement=refinement_options))
+    runs, threads_used = [], []
+
+    def adjust(problem, bundle):
+        threads_used.append(bundle.threads)
+        return bundle_adjust(problem, bundle)
+
+    monkeypatch.setattr(refinement, "bundle_adjust", adjust)
     for threads in (1, 3):
         graph = verify_pairs(scene.graph, scene.truth.cameras, camera_of_image, TwoViewOptions(), 5, threads)
-        known = np.array([False])
-        runs.append(map_automatic(graph, scene.truth.cameras, camera_of_image, known, AutomaticOptions(), 5))
+        runs.append(map_automatic(graph, scene.truth.cameras, camera_of_image, known, options.with_threads(threads), 5))
+    assert set(threads_used) == {1, 3}
     first, second = (run.reconstruction for run in runs)
     np.testing.assert_array_equal(first.points.xyz, second.points.xyz)
     np.testing.assert_array_equal(first.cameras[0].params, second.cameras[0].params)
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_progress_counts_photos_and_models(mapper):
+    scene, events = scene_of(), []
+    camera_of_image, known = np.zeros(8, dtype=np.int64), np.array([True])
+    graph = verify_pairs(scene.graph, scene.truth.cameras, camera_of_image, TwoViewOptions(), 0, 2, events.append)
+    options = AutomaticOptions(mapper=mapper)
+    map_automatic(graph, scene.truth.cameras, camera_of_image, known, options, 0, on_progress=events.append)
+    assert list(dict.fromkeys(e.stage for e in events)) == ["verifying pairs", "registering photos", "finishing models"]
+    for stage, total in (("verifying pairs", len(graph.matches)), ("registering photos", 8), ("finishing models", 1)):
+        done = [e.done for e in events if e.stage == stage]
+        assert done[0] == 0
+        assert done == sorted(done)
+        assert done[-1] == total
+        assert {e.total for e in events if e.stage == stage} == {total}
 
 
 def test_two_unrelated_scenes_become_two_models():

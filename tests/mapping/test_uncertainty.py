@@ -8,6 +8,7 @@ from fieldstone.geometry.rotation import log
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.model.uncertainty import LOSSES, robust_factor
 from fieldstone.scene.alignment import align, transformed
+from fieldstone.solve.bundle import covariance
 from fieldstone.solve.bundle.adjustment import BundleOptions
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
@@ -88,3 +89,15 @@ def test_covariances_are_symmetric_and_positive_and_only_on_request(runs):
     graph, cameras, one = run.graph, scene.truth.cameras, np.zeros(8, dtype=np.int64)
     plain = map_automatic(graph, cameras, one, np.array([True]), replace(AutomaticOptions(), covariance=False), 0)
     assert plain.uncertainty is None
+
+
+def test_a_model_too_large_for_a_covariance_is_a_model_and_a_note(runs, monkeypatch):
+    """12,000 columns are some 2,000 photos; 8 photos are 48."""
+    scene, run = runs[0]
+    monkeypatch.setattr(covariance, "MAX_COLUMNS", 47)
+    one = np.zeros(8, dtype=np.int64)
+    options = AutomaticOptions(covariance=True)
+    without = map_automatic(run.graph, scene.truth.cameras, one, np.array([True]), options, 0)
+    assert without.uncertainty is None
+    np.testing.assert_array_equal(without.reconstruction.points.xyz, run.reconstruction.points.xyz)
+    assert [note for note in without.notes if "no covariance" in note and "47 are allowed" in note]

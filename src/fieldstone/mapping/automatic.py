@@ -37,7 +37,7 @@ from fieldstone.mapping.model.working_model import WorkingModel, record_views, t
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, select_camera_models
 from fieldstone.mapping.textbook import four_poses
 from fieldstone.progress import OnProgress, StageProgress, silent
-from fieldstone.scene.mapping_run import Drop, MappingRun
+from fieldstone.scene.mapping_run import Drop, MappingRun, Uncertainty
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
 
@@ -176,7 +176,7 @@ def to_mapping_run(
     best, first = finished[0], sub_models[0]
     records = record_views(best.before, graph.names, "before BA") + record_views(best.model, graph.names, "after BA")
     start_cameras = with_models(cameras, first.calibration)
-    uncertainty = model_uncertainty(best.model, best.calibration, best.refinement) if options.covariance else None
+    uncertainty, notes = _uncertainty(best) if options.covariance else (None, ())
     return MappingRun(
         to_reconstruction(best.model, graph),
         graph,
@@ -186,9 +186,18 @@ def to_mapping_run(
         to_reconstruction(best.before, graph),
         verdicts,
         tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
-        tuple(_describe(trial) for trial in best.trials) + tuple(_describe_camera(c) for c in best.model.cameras),
+        (*(_describe(trial) for trial in best.trials), *(_describe_camera(c) for c in best.model.cameras), *notes),
         uncertainty,
     )
+
+
+def _uncertainty(best: FinishedModel) -> tuple[Uncertainty | None, tuple[str, ...]]:
+    """How well the model is determined; where that cannot be computed, nothing and a note that says why."""
+    try:
+        return model_uncertainty(best.model, best.calibration, best.refinement), ()
+    except ValueError as error:
+        logger.warning("no covariance: %s", error)
+        return None, (f"no covariance: {error}",)
 
 
 def _verdicts(graph: MatchGraph, sub_models: Sequence[SubModel], models: Sequence[WorkingModel]) -> dict[str, str]:

@@ -12,16 +12,6 @@ from fieldstone.records.mapping import ErrorRow
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
-STAGES = (
-    "linear triangulation",
-    "non-linear triangulation",
-    "linear PnP",
-    "PnP RANSAC",
-    "non-linear PnP",
-    "before BA",
-    "after BA",
-)
-
 
 @dataclass(frozen=True, eq=False)
 class StageRecord:

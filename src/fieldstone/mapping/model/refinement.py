@@ -20,8 +20,6 @@ MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a 2-vector whose coordinates are normal with standard deviation 1."""
 LOSS_SCALES_PX = (0.25, 2.0)
 """Keypoints are hardly better than a tenth of a pixel, and what is worse than a pixel is no noise."""
-MIN_OBSERVATIONS_FOR_THREADS = 10_000
-"""Smaller adjustments take less time than threads cost."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +53,8 @@ class RefinementOptions:
     """Rounds of adjustment and triangulation at the end."""
     threads: int = 1
     """Threads of an adjustment; results are the same for any number."""
+    min_observations_for_threads: int = 10_000
+    """Smaller adjustments take less time than threads cost."""
 
     def for_noise(self, scale_px: float) -> RefinementOptions:
         """The same with another scale of the loss of the last adjustments."""
@@ -143,7 +143,7 @@ def _solve(
 ) -> WorkingModel:
     """Adjust the free views and the points of a mask; other registered views that see these points hold them."""
     problem, registered, ids = bundle_problem(model, points, free, calibration, options.min_views_for_intrinsics)
-    threads = options.threads if len(problem.view) >= MIN_OBSERVATIONS_FOR_THREADS else 1
+    threads = options.threads if len(problem.view) >= options.min_observations_for_threads else 1
     bundle = replace(bundle, camera_priors=priors(problem.cameras, calibration), threads=threads)
     result = bundle_adjust(problem, bundle)
     return model.with_adjusted(result.problem, registered, ids)

@@ -26,7 +26,7 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
     """The covariances at the minimum that `refine_until_stable` has found, in the gauge of least variance.
 
     Raises:
-        ValueError: The model has so many photos that the dense inverse would not fit.
+        ValueError: The model has so many photos that the dense inverse would not fit, or is not determined.
     """
     problem, registered, _ = bundle_problem(
         model, model.is_point(), model.registered, calibration, options.min_views_for_intrinsics
