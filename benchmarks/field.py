@@ -1,4 +1,4 @@
-"""The fast field: quality against seconds, and nanoseconds of every kernel of a training step.
+"""The grid field: quality against seconds, and nanoseconds of every kernel of a training step.
 
     python -m benchmarks.field SCENE --budgets 10,60 [--no-alpha] [--threads 2] [--out FOLDER]
 
@@ -19,15 +19,18 @@ from pathlib import Path
 
 import numpy as np
 
+from fieldstone.field.grid.composite_numba import composite_backward
 from fieldstone.field.grid.decoder import HIDDEN
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
 from fieldstone.field.grid.exposure import gains_of
 from fieldstone.field.grid.field import FOREVER
 from fieldstone.field.grid.interpolation_numba import add_gradient, step_by_sample, step_touched
-from fieldstone.field.grid.march_numba import composite_backward, march_rays
+from fieldstone.field.grid.march_numba import march_rays
 from fieldstone.field.grid.step_numba import draw_rays
 from fieldstone.field.grid_training.plan import plan_from_json
-from fieldstone.field.grid_training.training import FastState, FastTraining, fast_training
+from fieldstone.field.grid_training.prepare import prepare_grid_training
+from fieldstone.field.grid_training.state import GridState
+from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.run.fast_fields import MAX_SIZE_PX, train_fast_run
 from fieldstone.run.field_input import read_ray_dataset
@@ -68,10 +71,17 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
     plan = plan_from_json(state_tensors["plan"].tobytes().decode())
     dataset = read_ray_dataset(scene, None, MAX_SIZE_PX)
     with ThreadPoolExecutor(1) as executor:
-        training = fast_training(
-            dataset.train, dataset.frame, plan, seed=0, executor=executor, use_alpha=use_alpha,
-            points_in_world=dataset.points_in_world, seen=dataset.seen, bounded=dataset.bounded,
-        )  # fmt: skip
+        training = prepare_grid_training(
+            dataset.train,
+            dataset.frame,
+            plan,
+            seed=0,
+            executor=executor,
+            use_alpha=use_alpha,
+            points_in_world=dataset.points_in_world,
+            seen=dataset.seen,
+            bounded=dataset.bounded,
+        )
         rows, about = kernel_times(training, training.from_tensors(state_tensors))
     show(about)
     for name, nanoseconds in rows:
@@ -79,29 +89,40 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
     show(f"  {'all':28s} {sum(ns for _, ns in rows):7.1f} ns")
 
 
-def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[str, float]], str]:
+def kernel_times(training: GridTraining, state: GridState) -> tuple[list[tuple[str, float]], str]:
     """Nanoseconds per weighing sample of each kernel, and what was measured."""
-    room, field, plan = state.workspace, state.field, state.plan
-    chunk, width, used = room.chunks[0], field.width, 4 * field.layout.num_levels
+    buffers, field, plan = state.buffers, state.field, state.plan
+    chunk, width, used = buffers.chunks[0], field.width, 4 * field.layout.num_levels
     rays, samples, work = chunk.rays, chunk.samples, chunk.work
     count, levels = int(state.chunk_rays[0]), field.layout.num_levels
     background = training.frame.background.astype(np.float32)
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
     gains = gains_of(state.exposure)
-    rates, kept, velocity = np.zeros(8, np.float32), np.ones(8, np.float32), state.velocity
-    tiny, decay = np.float32(1e-8), np.float32(plan.decay)
+    rates, decay_factors, mean_square = np.zeros(8, np.float32), np.ones(8, np.float32), state.mean_square
+    terms = plan.losses.terms(1.0, alpha_known=True)
+    tiny, decay = np.float32(1e-8), np.float32(plan.rates.mean_square_decay)
 
     def draw() -> None:
         draw_rays(training.rays, training.space, gains, state.cursor, count, 0, background, rays, 0)
 
     def march() -> tuple[int, int, int]:
         return march_rays(
-            room.grid, room.box, room.march, rays.origins, rays.directions, rays.jitter, FOREVER, count, width, samples,
-            rays.first, rays.passed,
-        )  # fmt: skip
+            buffers.grid,
+            buffers.box,
+            buffers.march,
+            rays.origins,
+            rays.directions,
+            rays.jitter,
+            FOREVER,
+            count,
+            width,
+            samples,
+            rays.first,
+            rays.end_transmittance,
+        )
 
     draw()
-    num_rays, n, asked = march()
+    num_rays, n, evaluations = march()
     counts = np.array([n], dtype=np.int64)
 
     def decode() -> None:
@@ -109,50 +130,63 @@ def kernel_times(training: FastTraining, state: FastState) -> tuple[list[tuple[s
         decode_numba(field.decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
 
     def composite() -> None:
-        composite_backward(
-            samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb,
-            work.d_weight, np.float32(1e-2), np.float32(plan.sparsity), np.float32(0), work.d_color, work.d_raw,
-            work.d_gain,
-        )  # fmt: skip
+        composite_backward(samples, rays, work, num_rays, terms, np.float32(1e-2))
 
     def back() -> None:
         decode_backward(
-            field.decoder, transposed, n, num_rays, samples.features, width, used, samples.ray, rays.views, work.hidden,
-            work.d_color, work.d_raw, work.d_per_ray, chunk.gradient,
-        )  # fmt: skip
+            field.decoder,
+            transposed,
+            n,
+            num_rays,
+            samples.features,
+            width,
+            used,
+            samples.ray,
+            rays.views,
+            work.hidden,
+            work.d_color,
+            work.d_log_density,
+            work.d_per_ray,
+            chunk.gradient,
+        )
 
     def scatter(level: int) -> None:
         for half in (0, 1):
             arguments = (
-                room.grid,
+                buffers.grid,
                 level,
                 half,
                 counts,
-                plan.samples_per_chunk,
+                plan.sampling.samples_per_chunk,
                 samples.position,
                 samples.features,
                 width,
             )
-            if level < levels - plan.immediate_levels:
-                add_gradient(*arguments, room.gradient, room.touched)
+            if level < levels - plan.rates.immediate_levels:
+                add_gradient(*arguments, buffers.gradient, buffers.touched)
             else:
-                step_by_sample(*arguments, velocity, rates, kept, decay, tiny)
+                step_by_sample(*arguments, mean_square, rates, decay_factors, decay, tiny)
 
     def step() -> None:
-        touched = len(room.touched)
-        step_touched(field.table, velocity, room.gradient, room.touched, 0, touched, rates, kept, decay, tiny)
+        touched = len(buffers.touched)
+        step_touched(
+            field.table, mean_square, buffers.gradient, buffers.touched, 0, touched, rates, decay_factors, decay, tiny
+        )
 
     rows = [("draw rays", best(draw)), ("march and interpolate", best(march)), ("decode", best(decode))]
     rows += [("composite, loss", best(composite)), ("decode backward", best(back))]
     for level, resolution in enumerate(field.layout.resolutions):
         rows.append((f"scatter level {resolution}", best(lambda level=level: scatter(level))))
-    for level in range(levels - plan.immediate_levels):
+    for level in range(levels - plan.rates.immediate_levels):
         scatter(level)
     rows.append(
-        ("step touched blocks", best(step, before=lambda: [scatter(k) for k in range(levels - plan.immediate_levels)]))
+        (
+            "step touched blocks",
+            best(step, before=lambda: [scatter(k) for k in range(levels - plan.rates.immediate_levels)]),
+        )
     )
-    about = f"{num_rays} rays, {asked / num_rays:.1f} steps asked and {n / num_rays:.1f} samples that weigh per ray"
-    return [(name, seconds / n * 1e9) for name, seconds in rows], about
+    per_ray = f"{evaluations / num_rays:.1f} density evaluations and {n / num_rays:.1f} samples that weigh per ray"
+    return [(name, seconds / n * 1e9) for name, seconds in rows], f"{num_rays} rays, {per_ray}"
 
 
 def best(work: Callable[[], object], before: Callable[[], object] = lambda: None) -> float:

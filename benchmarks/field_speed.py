@@ -24,7 +24,8 @@ import numpy as np
 
 from fieldstone.field.base.radiance_field import in_world
 from fieldstone.field.base.training import PRESETS, train
-from fieldstone.field.grid.field import field_from_tensors, renderer
+from fieldstone.field.grid.field import field_from_tensors
+from fieldstone.field.grid.render import renderer
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.render.views import progressive_views, render_view
 from fieldstone.run.field_input import read_ray_dataset

@@ -6,17 +6,16 @@ import numpy as np
 from benchmarks.blender_house import blender_matrix, direction
 from benchmarks.field import kernel_times
 
-from fast_scenes import FRAME, ball_images
-from fieldstone.field.grid_training.plan import FastPlan
-from fieldstone.field.grid_training.training import fast_training
+from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.synthetic.light import look_at
+from grid_scenes import FRAME, ball_images, plan_of
 
 
 def test_every_kernel_of_a_step_is_timed():
-    plan = FastPlan(finest=32, steps=(2,) * 8, num_chunks=2, samples_per_chunk=512)
+    plan = plan_of(finest=32, steps=(2,) * 8, num_chunks=2, samples_per_chunk=512)
     with ThreadPoolExecutor(1) as executor:
-        training = fast_training(ball_images(), FRAME, plan, seed=0, executor=executor)
-        state, _ = training.step(training.start())
+        training = prepare_grid_training(ball_images(), FRAME, plan, seed=0, executor=executor)
+        state, _ = training.advance(training.start())
         rows, about = kernel_times(training, state)
     assert all(nanoseconds > 0 for _, nanoseconds in rows)
     assert {"march and interpolate", "decode backward", "step touched blocks"} <= {name for name, _ in rows}

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA
 from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.evidence.borders import kept_inside_borders
 from fieldstone.geometry.rigid3 import Rigid3
+from grid_scenes import CAMERA
 
 SHAPE = (CAMERA.height, CAMERA.width, 3)
 

@@ -22,18 +22,18 @@ def scene():
 
 
 def test_specks_go_with_their_rim_and_nothing_else(scene):
-    occupancy, solid, places = scene
+    occupancy, solid, points_in_grid = scene
     expected = np.ones_like(solid)
     expected[(slice(7, 11),) * 3] = False
-    found = without_floaters(occupancy, solid, places, contracted_space())
+    found = without_floaters(occupancy, solid, points_in_grid, contracted_space())
     np.testing.assert_array_equal(found.cells, expected)
 
 
 def test_in_a_bounded_box_nothing_is_far_away(scene):
-    occupancy, solid, places = scene
+    occupancy, solid, points_in_grid = scene
     solid[WALL] = False
     solid[0, 4, 4:6] = True
-    found = without_floaters(occupancy, solid, places, box_space())
+    found = without_floaters(occupancy, solid, points_in_grid, box_space())
     assert not found.cells[0, 4, 4:6].any()
     assert found.cells[THING].all()
 
@@ -47,15 +47,17 @@ def test_a_point_beside_a_piece_ties_it(scene):
 
 
 def test_points_that_would_cost_the_scene_most_of_it_are_not_believed(scene):
-    occupancy, solid, places = scene
-    assert without_floaters(occupancy, solid, places, box_space()) is occupancy
+    occupancy, solid, points_in_grid = scene
+    assert without_floaters(occupancy, solid, points_in_grid, box_space()) is occupancy
 
 
 def test_points_outside_and_at_infinity_tie_nothing(scene):
-    occupancy, solid, places = scene
-    strange = np.vstack([places, np.full((1, 3), 50.0), np.full((1, 3), np.nan)])
+    occupancy, solid, points_in_grid = scene
+    strange = np.vstack([points_in_grid, np.full((1, 3), 50.0), np.full((1, 3), np.nan)])
     found = without_floaters(occupancy, solid, strange, contracted_space())
-    np.testing.assert_array_equal(found.cells, without_floaters(occupancy, solid, places, contracted_space()).cells)
+    np.testing.assert_array_equal(
+        found.cells, without_floaters(occupancy, solid, points_in_grid, contracted_space()).cells
+    )
 
 
 def test_places_are_where_the_corners_of_cells_come_from():
@@ -63,6 +65,6 @@ def test_places_are_where_the_corners_of_cells_come_from():
     box = full_box(np.full(3, -3.0), np.full(3, 6.0), 8)
     corners = corners_in_world(box, frame, contracted_space())[1:-1, 1:-1, 1:-1]  # the outermost: infinity
     normalized = frame.normalized_from_world.apply(corners.reshape(-1, 3))
-    places = grid_from_normalized(contracted_space(), normalized).reshape(corners.shape)
+    points_in_grid = grid_from_normalized(contracted_space(), normalized).reshape(corners.shape)
     index = np.stack(np.meshgrid(*(np.arange(1, 8),) * 3, indexing="ij"), axis=-1)
-    np.testing.assert_allclose(places, box.lower + index * box.cell_size, atol=1e-9)
+    np.testing.assert_allclose(points_in_grid, box.lower + index * box.cell_size, atol=1e-9)

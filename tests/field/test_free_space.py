@@ -4,22 +4,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA, FRAME
 from fieldstone.field.base.projection import projection_for
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
 from fieldstone.field.base.space import contracted_space, grid_from_normalized, projective_space
 from fieldstone.field.evidence.free_space import (
-    FREE_SHARE,
-    PROBABLE_SHARE,
+    FREE_FRACTION,
+    FREE_LOSS_FRACTION,
     carve_free_space,
     corners_in_world,
-    probably_free,
+    free_distances,
 )
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.scene.rays import rays_from_view
+from grid_scenes import CAMERA, FRAME
 
 PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
 WALL = 4.0
@@ -84,7 +84,7 @@ def test_what_no_photo_sees_is_empty_around_a_camera_only():
     of_cell = np.stack([corners[1 - i :, 1 - j :, 1 - k :][:48, :48, :48] for i, j, k in np.ndindex(2, 2, 2)])
     behind, away = (of_cell[..., 2] < 0).all(axis=0), np.linalg.norm(of_cell, axis=-1)
     # The wall is 4 away from both cameras, which are 0.05 apart.
-    around = behind & (away.max(axis=0) < FREE_SHARE * WALL)
+    around = behind & (away.max(axis=0) < FREE_FRACTION * WALL)
     elsewhere = behind & (away.min(axis=0) > WALL)
     assert around.sum() > 1000
     assert elsewhere.sum() > 1000
@@ -135,11 +135,11 @@ def test_photos_probably_see_nearly_as_far_as_the_points_around():
     world = Sim3(0.5, np.eye(3), np.zeros(3))
     frame = replace(FRAME, normalized_from_world=world)
     for image in images:
-        found = probably_free(frame, seen)(image)
+        found = free_distances(frame, seen)(image)
         rays = rays_from_view(image.camera, image.cam_from_world)
         true = 0.5 * WALL / rays.directions[:, 2]
         # Blocks of pixels take the least of the points around them.
-        assert np.all(found < PROBABLE_SHARE * true * 1.02)
-        assert np.median(found / true) > 0.95 * PROBABLE_SHARE
-    unknown = probably_free(frame, {})(images[0])
+        assert np.all(found < FREE_LOSS_FRACTION * true * 1.02)
+        assert np.median(found / true) > 0.95 * FREE_LOSS_FRACTION
+    unknown = free_distances(frame, {})(images[0])
     np.testing.assert_array_equal(unknown, np.zeros(CAMERA.width * CAMERA.height))

@@ -24,7 +24,7 @@ class TwoHalves:
 
     to_tensors = from_tensors = renderer = lambda self, state, /: state
 
-    def step(self, state, /):
+    def advance(self, state, /):
         state = (state[0] + 1, state[1])
         state[1][0] += 1
         if state[0] == 3:
@@ -37,9 +37,12 @@ def test_a_step_is_finished_before_its_checkpoint_is_written():
     saved = []
     with pytest.raises(KeyboardInterrupt):
         train(
-            TwoHalves(), (0, np.zeros(2)), budget_s=None, max_steps=9,
+            TwoHalves(),
+            (0, np.zeros(2)),
+            budget_s=None,
+            max_steps=9,
             save=lambda state, curve: saved.append((state[0], *state[1], len(curve))),
-        )  # fmt: skip
+        )
     assert saved == [(3, 3.0, 3.0, 3)]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -91,7 +94,11 @@ def test_other_threads_hear_nothing():
 def test_the_state_shown_now_and_then_is_that_after_a_step():
     shown = []
     train(
-        TwoHalves(), (3, np.zeros(2)), budget_s=None, max_steps=4,
-        show=lambda state: shown.append((state[0], *state[1])), show_every_s=0.0,
-    )  # fmt: skip
+        TwoHalves(),
+        (3, np.zeros(2)),
+        budget_s=None,
+        max_steps=4,
+        show=lambda state: shown.append((state[0], *state[1])),
+        show_every_s=0.0,
+    )
     assert shown == [(4, 1.0, 1.0), (5, 2.0, 2.0), (6, 3.0, 3.0), (7, 4.0, 4.0)]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numba import njit
 
-from fast_scenes import CAMERA, RADIUS, ball_images
 from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.march_numba import distance_at
 from fieldstone.field.grid.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
+from grid_scenes import CAMERA, RADIUS, ball_images
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.05, 1.0])

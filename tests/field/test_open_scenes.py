@@ -6,22 +6,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
 from fieldstone.field.base.space import contracted_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.field.grid.rays import ray_table
-from fieldstone.field.grid_training.plan import FastPlan
-from fieldstone.field.grid_training.training import FastTraining, fast_training
+from fieldstone.field.grid_training.prepare import prepare_grid_training
+from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.scene.rays import rays_from_view
+from grid_scenes import CAMERA, FRAME, RADIUS, ball_images, plan_of
 
-PLAN = FastPlan(
-    finest=32, steps=(20, 20, 20, 20, 20, 10, 5, 5), num_chunks=4, samples_per_chunk=512, scout=False, raw_offset=-3.0,
-    prune_density=0.01, min_weight=4e-3, clear_fog_from=4, exposure_rate=0.03, point_weight=0.1,
-)  # fmt: skip
+PLAN = plan_of(
+    finest=32,
+    steps=(20, 20, 20, 20, 20, 10, 5, 5),
+    num_chunks=4,
+    samples_per_chunk=512,
+    box_warm_up=False,
+    density_bias=-3.0,
+    prune_density=0.01,
+    min_weight=4e-3,
+    clear_initial_density_from=4,
+    exposure_rate=0.03,
+    sparse_depth_weight=0.1,
+)
 
 GAINS = 1.0 + 0.25 * np.cos(2.0 * np.arange(20))
 
@@ -41,17 +50,17 @@ def photographed(seed=0):
     return tuple(images), seen
 
 
-def training(executor, images, seen, plan=PLAN) -> FastTraining:
+def training(executor, images, seen, plan=PLAN) -> GridTraining:
     points = np.concatenate([points.xyz for points in seen.values()])
     dark = replace(FRAME, background=np.zeros(3))
-    return fast_training(
+    return prepare_grid_training(
         images, dark, plan, seed=0, executor=executor, points_in_world=points, seen=seen, bounded=False
     )
 
 
 def run(work, state, steps):
     for _ in range(steps):
-        state, _ = work.step(state)
+        state, _ = work.advance(state)
     return state
 
 
@@ -71,7 +80,7 @@ def test_neither_threads_nor_a_stop_change_a_bit():
             if threads == 2:
                 saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
                 state = work.from_tensors(saved)
-            results.append(work.to_tensors(run(work, state, PLAN.total_steps - 45)))
+            results.append(work.to_tensors(run(work, state, PLAN.schedule.total_steps - 45)))
     same_tensors(*results)
     assert np.any(results[0]["exposure_log_gain"] != 0)
 
@@ -80,7 +89,7 @@ def test_the_exposures_of_photos_are_told_from_the_colours_of_the_scene():
     images, seen = photographed()
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, images[1:], seen)
-        state = run(work, work.start(), PLAN.total_steps)
+        state = run(work, work.start(), PLAN.schedule.total_steps)
         shown = work.renderer(state)(rays_from_view(CAMERA, images[0].cam_from_world)).rgb
     found = np.exp(state.exposure.log_gain.reshape(-1, 3).mean(axis=1))
     assert np.corrcoef(found, GAINS[1:])[0, 1] > 0.9
@@ -94,10 +103,10 @@ def test_a_speck_in_the_air_is_given_up_when_its_stage_begins(clear):
     """Set by hand just before stage 3, beside spots of the same size on the ball, where there are known points."""
     images, seen = photographed()
     stage = 3
-    plan = replace(PLAN, clear_floaters_from=stage if clear else len(PLAN.steps))
+    plan = PLAN.replaced(clear_floaters_from=stage if clear else len(PLAN.schedule.steps))
     with ThreadPoolExecutor(1) as executor:
         work = training(executor, images, seen, plan)
-        state = run(work, work.start(), sum(PLAN.steps[:stage]) - 1)
+        state = run(work, work.start(), sum(PLAN.schedule.steps[:stage]) - 1)
         layout, occupancy = state.field.layout, state.field.occupancy
         state.field.table[:] = 0.0
         layout.level(state.field.table, 0)[..., 0] = -9.0

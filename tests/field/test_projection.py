@@ -1,14 +1,13 @@
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA, FRAME
 from fieldstone.field.base.projection import (
     distance_along,
     project_points,
     project_rays,
     projection_for,
     unproject_points,
-)  # fmt: skip
+)
 from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.base.space import projective_space
 from fieldstone.field.base.space_numba import marched_ray_numba
@@ -16,6 +15,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
 from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.rays import rays_from_view
+from grid_scenes import CAMERA, FRAME
 
 PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
 

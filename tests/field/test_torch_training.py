@@ -167,14 +167,14 @@ def test_a_collapsed_field_is_noticed_and_started_again(monkeypatch, caplog):
         with caplog.at_level(logging.WARNING):
             for _ in range(4):
                 before = state.parameters
-                state, _ = t.step(state)
+                state, _ = t.advance(state)
                 assert torch.equal(state.parameters, before)
             assert state.flat_steps == 4
-            state, _ = t.step(state)
+            state, _ = t.advance(state)
         assert "flat colour" in caplog.text
         assert (state.attempt, state.attempt_step, state.step, state.flat_steps) == (1, 0, 5, 0)
         assert not torch.equal(state.parameters, t.start().parameters)
-        state, second_report = t.step(state)
+        state, second_report = t.advance(state)
         assert state.attempt_step == 1
         assert np.isfinite(second_report.loss)
 

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.io.images.photos import write_photo
 from fieldstone.run import fast_fields
 from fieldstone.run.fast_fields import train_fast_run
+from grid_scenes import ball_images
 
 STEPS = {"finest": 24, "steps": [6] * 8, "num_chunks": 2, "samples_per_chunk": 256}
 
@@ -120,7 +120,7 @@ def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
     def too_much(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr(fast_fields, "fast_training", too_much)
+    monkeypatch.setattr(fast_fields, "prepare_grid_training", too_much)
     monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
     folder = write_scene(tmp_path)
     assert main(["train", str(folder), "-o", str(folder / "out"), "--threads", "1"]) == 5
@@ -131,7 +131,7 @@ def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_a_held_out_photo_of_another_size_is_found_before_training(tmp_path, monkeypatch):
     folder = write_scene(tmp_path)
-    monkeypatch.setattr(fast_fields, "fast_training", lambda *arguments, **options: pytest.fail("began to train"))
+    monkeypatch.setattr(fast_fields, "prepare_grid_training", lambda *arguments, **options: pytest.fail("began to train"))
     monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
     scene = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps({**scene, "w": 40, "h": 32}))

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fast_scenes import ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
@@ -16,6 +15,7 @@ from fieldstone.io.posed.posed_photos import PosedPhoto
 from fieldstone.run import fast_fields, fast_stages
 from fieldstone.run.fast_fields import size_in_memory, train_fast_run
 from fieldstone.run.fields import split_tensors
+from grid_scenes import ball_images
 
 CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 1500.0]))
 

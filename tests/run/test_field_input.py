@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from fast_scenes import ball_images
 from fieldstone.errors import InputError
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
 from fieldstone.io.images.photos import write_photo
@@ -13,6 +12,7 @@ from fieldstone.io.shapes.ply import write_points
 from fieldstone.render.camera_paths import look_at
 from fieldstone.run.field_input import open_field_input, read_ray_dataset
 from fieldstone.scene.reconstruction import Points
+from grid_scenes import ball_images
 
 
 def write_transforms(folder, *, alpha, **top):

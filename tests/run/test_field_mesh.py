@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from fast_scenes import RADIUS, ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.io.images.photos import write_photo
@@ -13,6 +12,7 @@ from fieldstone.io.shapes.ply import read_points
 from fieldstone.run.fast_fields import train_fast_run
 from fieldstone.run.mesh import mesh_run
 from fieldstone.run.splats import splat_run
+from grid_scenes import RADIUS, ball_images
 
 
 @pytest.fixture(scope="module")

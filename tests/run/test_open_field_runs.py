@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA, RADIUS, ball_images
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
@@ -16,6 +15,7 @@ from fieldstone.io.models.colmap import write_colmap
 from fieldstone.run.fast_fields import train_fast_run
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
+from grid_scenes import CAMERA, RADIUS, ball_images
 
 WHITE_ROWS = 24
 

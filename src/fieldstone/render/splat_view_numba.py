@@ -15,7 +15,7 @@ from fieldstone.scene.splats import Splats, splat_colors
 DILATION = 0.3
 """Variance in pixels^2 that every splat gets in the image, so that none is smaller than a pixel."""
 
-NEAR, MIN_ALPHA, MAX_ALPHA, MIN_LIGHT = 0.05, 1.0 / 255.0, 0.99, 1e-4
+NEAR, MIN_ALPHA, MAX_ALPHA, EARLY_STOP_EPS = 0.05, 1.0 / 255.0, 0.99, 1e-4
 REACH = 3.0
 """Splats end at this many standard deviations."""
 
@@ -44,17 +44,17 @@ def splat_view(
     pixels = camera.principal_point + np.stack([fx * x / z, fy * y / z], axis=1)
     colors = splat_colors(splats, cam_from_world.target_origin_in_source())[order]
     out = np.zeros((camera.height, camera.width, 3))
-    light = np.ones((camera.height, camera.width))
+    transmittance = np.ones((camera.height, camera.width))
     reach = REACH * np.sqrt(np.stack([covariance[:, 0, 0], covariance[:, 1, 1]], axis=1))
-    _blend(pixels, reach, np.linalg.inv(covariance), splats.opacities[order], colors, out, light)
-    return out + light[..., None] * background
+    _blend(pixels, reach, np.linalg.inv(covariance), splats.opacities[order], colors, out, transmittance)
+    return out + transmittance[..., None] * background
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _blend(pixels, reach, inverse, opacities, colors, out, light):
+def _blend(pixels, reach, inverse, opacities, colors, out, transmittance):
     """Add splats, nearest first. pixels, reach: (n, 2). inverse: (n, 2, 2). out: (h, w, 3). light: (h, w)."""
-    height, width = light.shape
+    height, width = transmittance.shape
     for n in range(pixels.shape[0]):
         u, v = pixels[n, 0], pixels[n, 1]
         if not np.isfinite(u + v + reach[n, 0] + reach[n, 1]):
@@ -64,8 +64,8 @@ def _blend(pixels, reach, inverse, opacities, colors, out, light):
         a, b, c = inverse[n, 0, 0], inverse[n, 0, 1], inverse[n, 1, 1]
         for j in range(y0, y1 + 1):
             for i in range(x0, x1 + 1):
-                left = light[j, i]
-                if left < MIN_LIGHT:
+                before = transmittance[j, i]
+                if before < EARLY_STOP_EPS:
                     continue
                 du, dv = i + 0.5 - u, j + 0.5 - v
                 alpha = opacities[n] * np.exp(-0.5 * (a * du * du + 2.0 * b * du * dv + c * dv * dv))
@@ -73,5 +73,5 @@ def _blend(pixels, reach, inverse, opacities, colors, out, light):
                     continue
                 alpha = min(alpha, MAX_ALPHA)
                 for k in range(3):
-                    out[j, i, k] += left * alpha * colors[n, k]
-                light[j, i] = left * (1.0 - alpha)
+                    out[j, i, k] += before * alpha * colors[n, k]
+                transmittance[j, i] = before * (1.0 - alpha)

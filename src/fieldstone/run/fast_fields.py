@@ -24,15 +24,10 @@ from fieldstone.field.base.radiance_field import FieldFrame, FieldTraining, in_w
 from fieldstone.field.base.ray_dataset import PosedImage, RayDataset, reduce_image
 from fieldstone.field.base.training import CurvePoint, OnStep
 from fieldstone.field.grid.exposure import gain_at
-from fieldstone.field.grid_training.plan import (
-    STAGE_SHARES,
-    FastPlan,
-    finest_for,
-    first_plan,
-    plan_for_budget,
-    plan_from_json,
-)  # fmt: skip
-from fieldstone.field.grid_training.training import FastTraining, fast_training
+from fieldstone.field.grid_training.budget import finest_for, first_plan, plan_for_budget
+from fieldstone.field.grid_training.plan import NUM_STAGES, GridPlan, Schedule, plan_from_json
+from fieldstone.field.grid_training.prepare import prepare_grid_training
+from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
@@ -77,7 +72,7 @@ TIME_KEPT = 0.97
 """Share of the budget that is planned for: the last steps and the last checkpoint take what they take."""
 
 
-StepsBy = Callable[[FastTraining], FieldTraining[Any]]
+StepsBy = Callable[[GridTraining], FieldTraining[Any]]
 """Who does the steps of a training."""
 
 
@@ -118,7 +113,7 @@ def train_fast_run(
         size_px: Photos are reduced to this length of their longer side; None: to what fits, see `size_in_memory`.
         refine_poses: Move the training photos so that the field fits them, held by known points. Held-out photos stay.
         hold_out: Photos to measure with instead of the default, see `field_input.holding_out`.
-        device: Where steps are computed: cpu, or a device of torch, see `torch_fast_training`. Equal plans then give
+        device: Where steps are computed: cpu, or a device of torch, see `grid_torch.training`. Equal plans then give
             equal fields to rounding only. Rendering stays on the CPU.
 
     Returns:
@@ -177,7 +172,7 @@ def train_fast_run(
         "steps": state.step,
         "field": "fast",
         "alpha": use_alpha,
-        "plan": asdict(state.plan),
+        "plan": state.plan.to_settings(),
         "device": device,
         "threads": threads,
         "seed": seed,
@@ -197,16 +192,16 @@ def steps_on(device: str) -> StepsBy:
     if device == "cpu":
         return lambda training: training
     with torch_for(f"the fast field on {device}"):
-        from fieldstone.field.grid_torch.training import TorchFastTraining
+        from fieldstone.field.grid_torch.training import TorchGridTraining
         from fieldstone.field.nerf.training import torch_device
     found = torch_device(device)
     logger.warning("training on %s: this way was tested on torch's CPU device only, never on a GPU", device)
-    return lambda training: TorchFastTraining(training, found)
+    return lambda training: TorchGridTraining(training, found)
 
 
 def exposure_near(dataset: RayDataset, state: PlannedState) -> Callable[[PosedImage], np.ndarray] | None:
     """The exposure that a held-out view is shown with, from the training photos near it; None: none was learned."""
-    if state.plan.exposure_rate == 0:
+    if state.plan.rates.exposure_rate == 0:
         return None
     log_gain = state.exposure.log_gain.astype(np.float64).reshape(-1, 3)
     poses = Rigid3.stack([image.cam_from_world for image in dataset.train])
@@ -220,11 +215,11 @@ def compile_kernels(executor: Executor, steps_by: StepsBy = lambda training: tra
     pixels[:3], pixels[:, :3] = 0, 0
     image = PosedImage("compile", camera, Rigid3(np.eye(3), np.array([0.0, 0, 4])), pixels)
     frame = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
-    plan = FastPlan(finest=64, steps=(1,) * len(STAGE_SHARES), num_chunks=1, samples_per_chunk=256)
-    training = steps_by(fast_training((image,), frame, plan, seed=0, executor=executor))
+    plan = GridPlan(Schedule(finest=64, steps=(1,) * NUM_STAGES)).replaced(num_chunks=1, samples_per_chunk=256)
+    training = steps_by(prepare_grid_training((image,), frame, plan, seed=0, executor=executor))
     state = training.start()
-    for _ in range(plan.total_steps):
-        state, _ = training.step(state)
+    for _ in range(plan.schedule.total_steps):
+        state, _ = training.advance(state)
     training.renderer(state)(training_view(image))
 
 
@@ -237,17 +232,17 @@ def training_view(image: PosedImage) -> Any:
 
 def _open(
     dataset: RayDataset,
-    given: FastPlan | None,
+    given: GridPlan | None,
     budget_s: float,
     use_alpha: bool,
     refine_poses: bool,
     seed: int,
     executor: Executor,
     memory_gib: float = 4.0,
-) -> FastTraining:
+) -> GridTraining:
     """The training of a dataset, with the given plan or a provisional one."""
     provisional = given or first_plan(64, budget_s, bounded=True)
-    training = fast_training(
+    training = prepare_grid_training(
         dataset.train,
         dataset.frame,
         provisional,
@@ -257,7 +252,7 @@ def _open(
         points_in_world=dataset.points_in_world,
         seen=dataset.seen,
         bounded=dataset.bounded,
-        refine_poses=given.refine_poses if given is not None else refine_poses,
+        refine_poses=given.schedule.refine_poses if given is not None else refine_poses,
     )
     if given is not None:
         return training
@@ -273,7 +268,7 @@ def _open(
         finest = min(2 * finest, MAX_UNBOUNDED)
     finest = min(finest, _finest_in_memory(training, dataset.train, memory_gib))
     plan = first_plan(finest, budget_s, bounded=not training.space.is_open)
-    return replace(training, plan=replace(plan, refine_poses=refine_poses))
+    return replace(training, plan=plan.replaced(refine_poses=refine_poses))
 
 
 def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
@@ -288,7 +283,7 @@ def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
     return size
 
 
-def _finest_in_memory(training: FastTraining, images: Sequence[PosedImage], memory_gib: float) -> int:
+def _finest_in_memory(training: GridTraining, images: Sequence[PosedImage], memory_gib: float) -> int:
     """Cells along the longest side whose grids fit beside the photos and their rays.
 
     A vertex of the finest level has 32 bytes of values and velocities, all coarser levels add a seventh and their
@@ -298,7 +293,7 @@ def _finest_in_memory(training: FastTraining, images: Sequence[PosedImage], memo
         InputError: Not even the coarsest grids fit.
     """
     rays = training.rays
-    used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings, rays.free))
+    used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings, rays.free_distance))
     used += sum(image.pixels.nbytes for image in images)
     left = memory_gib * 2**30 - used
     extent = training.occupancy.extent / np.max(training.occupancy.extent)
@@ -317,10 +312,10 @@ BYTES_PER_PIXEL, RAYS_SHARE = 36, 0.75
 """Bytes that a pixel and its ray take while the table of rays is made, and the share of the memory for them."""
 
 MAX_UNBOUNDED = 256
-"""As `fast_plan.MAX_FINEST`, for a box of which nearly all cells may be used."""
+"""As `plan.MAX_FINEST`, for a box of which nearly all cells may be used."""
 
 
-def followed_plan(out: Path, given: FastPlan | None) -> FastPlan | None:
+def followed_plan(out: Path, given: GridPlan | None) -> GridPlan | None:
     """The plan that is followed to the letter: of the run that `out` holds, else the given one, if there is one.
 
     Raises:
@@ -329,12 +324,12 @@ def followed_plan(out: Path, given: FastPlan | None) -> FastPlan | None:
     if not (out / CHECKPOINT).exists() or not (out / PLAN).exists():
         return given
     stored = _read_plan(out / PLAN)
-    if given is not None and replace(given, stop_after=None) != replace(stored, stop_after=None):
+    if given is not None and given.replaced(stop_after=None) != stored.replaced(stop_after=None):
         raise InputError(f"{out}: holds a run of another plan than --plan; leave it out, or choose another folder")
     return stored
 
 
-def _read_plan(path: Path) -> FastPlan:
+def _read_plan(path: Path) -> GridPlan:
     try:
         return plan_from_json(path.read_text())
     except (OSError, ValueError) as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -14,7 +13,8 @@ from fieldstone.field.base.interrupts import deferred_interrupts
 from fieldstone.field.base.radiance_field import FieldTraining
 from fieldstone.field.base.training import CurvePoint, OnStep, train
 from fieldstone.field.grid.exposure import Exposure
-from fieldstone.field.grid_training.plan import FastPlan, corrected
+from fieldstone.field.grid_training.budget import corrected
+from fieldstone.field.grid_training.plan import GridPlan
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class PlannedState(Protocol):
     """A state of a training that follows a plan, on whatever device."""
 
     @property
-    def plan(self) -> FastPlan:
+    def plan(self) -> GridPlan:
         """What is followed."""
         ...
 
@@ -46,7 +46,7 @@ class PlannedState(Protocol):
         """Of every photo."""
         ...
 
-    def with_plan(self: P, plan: FastPlan) -> P:
+    def with_plan(self: P, plan: GridPlan) -> P:
         """The same state, with other steps to come."""
         ...
 
@@ -76,11 +76,12 @@ def train_stages(
         saved = time.perf_counter()
 
     with deferred_interrupts() as check:
-        while state.step < min(state.plan.total_steps, max_steps or state.plan.total_steps):
+        while state.step < min(state.plan.schedule.total_steps, max_steps or state.plan.schedule.total_steps):
             plan = state.plan
-            stage = plan.stage_of(state.step)
-            end = sum(plan.steps[: stage + 1])
-            last = min(end, plan.total_steps, max_steps or end)
+            schedule = plan.schedule
+            stage = schedule.stage_of(state.step)
+            end = sum(schedule.steps[: stage + 1])
+            last = min(end, schedule.total_steps, max_steps or end)
             before, began = state.step, time.perf_counter()
             left = None if deadline is None else deadline - began + (curve[-1].seconds if curve else 0.0)
             state, curve = train(
@@ -89,20 +90,22 @@ def train_stages(
             )  # fmt: skip
             now = time.perf_counter()
             if state.step < last:
-                state = state.with_plan(replace(state.plan, stop_after=state.step))
-                logger.warning("the time is over after %d of %d steps", state.step, sum(plan.steps))
-            elif deadline is not None and stage + 1 < len(plan.steps) and last == end:
-                slower = 1.4 if plan.levels(stage + 1) != plan.levels(stage) else 1.0
+                state = state.with_plan(state.plan.replaced(stop_after=state.step))
+                logger.warning("the time is over after %d of %d steps", state.step, sum(schedule.steps))
+            elif deadline is not None and stage + 1 < len(schedule.steps) and last == end:
+                slower = 1.4 if schedule.levels(stage + 1) != schedule.levels(stage) else 1.0
                 per_step = slower * (now - began) / (state.step - before)
                 state = state.with_plan(corrected(plan, stage + 1, deadline - now, per_step))
                 took = now - began
-                logger.info("stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, took, state.plan.steps)
+                logger.info(
+                    "stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, took, state.plan.schedule.steps
+                )
             try:
                 check()
             except KeyboardInterrupt:
                 save(state, curve)
                 raise
-            if now - saved > SAVED_AFTER_S and state.step < state.plan.total_steps:
+            if now - saved > SAVED_AFTER_S and state.step < state.plan.schedule.total_steps:
                 keep(state, curve)
         preview(state)
         save(state, curve)
@@ -115,6 +118,6 @@ def measured_step(training: FieldTraining[Any]) -> float:
     times = []
     for _ in range(MEASURED_STEPS):
         began = time.perf_counter()
-        state, _ = training.step(state)
+        state, _ = training.advance(state)
         times.append(time.perf_counter() - began)
     return float(np.median(times[2:]))

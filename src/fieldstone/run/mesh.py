@@ -18,7 +18,8 @@ from jaxtyping import Float, Int
 from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_world, surface_depth
 from fieldstone.field.base.space import finite_box, grid_from_normalized, normalized_from_grid
-from fieldstone.field.grid.field import FastField, field_from_tensors, renderer
+from fieldstone.field.grid.field import GridField, field_from_tensors
+from fieldstone.field.grid.render import renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.atomic import write_json
@@ -102,7 +103,7 @@ def mesh_run(
 
 def solid_field(
     out: Path, purpose: str, cells: int | None, level: float
-) -> tuple[FastField, FieldFrame, Rigid3, dict[str, Any]]:
+) -> tuple[GridField, FieldFrame, Rigid3, dict[str, Any]]:
     """The fast field that training left in `out`, its frame, the training poses and the checkpoint's facts.
 
     Args:
@@ -126,7 +127,7 @@ def solid_field(
 
 
 def normalized_mesh(
-    field: FastField,
+    field: GridField,
     frame: FieldFrame,
     poses: Rigid3,
     header: Mapping[str, Any],

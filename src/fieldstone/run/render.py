@@ -16,7 +16,8 @@ from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, in_world
 from fieldstone.field.base.training import TrainOptions
-from fieldstone.field.grid.field import field_from_tensors, renderer
+from fieldstone.field.grid.field import field_from_tensors
+from fieldstone.field.grid.render import renderer
 from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.checkpoint import read_checkpoint

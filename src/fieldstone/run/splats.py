@@ -16,8 +16,9 @@ from fieldstone.evaluate.image_metrics import psnr, quantize
 from fieldstone.field.base.radiance_field import FieldFrame, in_world
 from fieldstone.field.base.space import grid_from_normalized
 from fieldstone.field.grid.decoder import decode
-from fieldstone.field.grid.field import FastField, renderer
+from fieldstone.field.grid.field import GridField
 from fieldstone.field.grid.interpolation_numba import interpolate_numba
+from fieldstone.field.grid.render import renderer
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.atomic import write_json
 from fieldstone.io.shapes.splats import write_splats
@@ -86,7 +87,7 @@ def splat_run(
     return record
 
 
-def splats_of_mesh(mesh: Mesh, field: FastField, frame: FieldFrame, poses: Rigid3) -> Splats:
+def splats_of_mesh(mesh: Mesh, field: GridField, frame: FieldFrame, poses: Rigid3) -> Splats:
     """The splats of the surface of a field, in the world of the photos.
 
     Args:

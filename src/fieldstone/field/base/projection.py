@@ -23,10 +23,10 @@ from fieldstone.geometry.camera import bearings_from_image
 MAX_ANGLE_DEG = 65.0
 """No pixel may look further away from the mean axis."""
 
-NEAR_SHARE = 0.9
+NEAR_FRACTION = 0.9
 """The near plane lies at this share of the depth of the nearest points (1st percentile)."""
 
-DEPTH_SHARE = 0.4
+DEPTH_RATIO = 0.4
 """Depth of the box over its longest side: cells along the rays may be longer than they are wide."""
 
 MARGIN = 1.02
@@ -68,7 +68,7 @@ def projection_for(
     centers = np.stack([world.apply(pose.target_origin_in_source()) for pose in poses])
     center = centers.mean(axis=0)
     depths = (world.apply(points_in_world) - center) @ axis
-    near = NEAR_SHARE * float(np.percentile(depths[depths > 0], 1)) if np.any(depths > 0) else 0.0
+    near = NEAR_FRACTION * float(np.percentile(depths[depths > 0], 1)) if np.any(depths > 0) else 0.0
     if near <= float(((centers - center) @ axis).max()) + 1e-6:
         return None
     corners = []
@@ -84,7 +84,7 @@ def projection_for(
         corners += [at_near[:, :2] / near, local[:, :2] / local[:, 2:]]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
     middle, half = (low + high) / 2, MARGIN * (high - low) / 2
-    depth = DEPTH_SHARE * float(2 * half.max())
+    depth = DEPTH_RATIO * float(2 * half.max())
     bounds = np.array([[*(middle - half), 0.0], [*(middle + half), depth]])
     projection = Projection(R.astype(np.float32), center.astype(np.float32), np.float32(near), np.float32(depth))
     return projection, bounds

@@ -94,16 +94,18 @@ S = TypeVar("S")
 class FieldTraining(Protocol[S]):
     """How one kind of field is trained; S is everything that the next step depends on.
 
-    The same state and step number always lead to the same next state, whatever the number of threads: random
-    numbers come from streams that are named by (seed, step), never from a generator that lives on between steps.
+    The same state always leads to the same next state, whatever the number of threads: random numbers come from
+    streams that are named by (seed, step), never from a generator that lives on between steps. A state is given away
+    when it is stepped, for its arrays may be stepped in place: copying grids would take longer than the step. To keep
+    one, keep its tensors.
     """
 
     def start(self) -> S:
         """The state before the first step."""
         ...
 
-    def step(self, state: S, /) -> tuple[S, StepReport]:
-        """One optimisation step."""
+    def advance(self, state: S, /) -> tuple[S, StepReport]:
+        """One optimisation step; `state` is given away, and must not be used again."""
         ...
 
     def to_tensors(self, state: S, /) -> dict[str, np.ndarray]:

@@ -138,7 +138,7 @@ def train(
             while (max_steps is None or len(points) < max_steps) and (
                 budget_s is None or not points or points[-1].seconds < budget_s
             ):
-                state, report = training.step(state)
+                state, report = training.advance(state)
                 now = time.perf_counter()
                 points.append(_curve_point(len(points) + 1, before + now - start - paused, report))
                 on_step(points[-1])

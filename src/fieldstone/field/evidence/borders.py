@@ -16,7 +16,7 @@ MAX_LEVEL = 8
 MIN_PHOTOS = 3
 """Fewer photos may all be dark at one place by chance."""
 
-MAX_SHARE = 0.15
+MAX_FRACTION = 0.15
 """More than this share of a photo is no border but a dark scene."""
 
 BLEND_PX = 2
@@ -39,6 +39,6 @@ def kept_inside_borders(images: Sequence[PosedImage]) -> Bool[np.ndarray, "h w"]
     label(black, output=regions)
     edges = np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]])
     border = np.isin(regions, np.unique(edges[edges > 0]))
-    if not border.any() or border.mean() > MAX_SHARE:
+    if not border.any() or border.mean() > MAX_FRACTION:
         return None
     return np.logical_not(binary_dilation(border, iterations=BLEND_PX))

@@ -13,7 +13,7 @@ from scipy.ndimage import label
 from fieldstone.field.base.space import Space
 from fieldstone.field.grid.occupancy import Occupancy, grown_by_one
 
-MOST_FLOATING = 0.3
+MAX_FLOATING_FRACTION = 0.3
 """If more of what is solid were to go than this share, the points do not speak for the scene."""
 
 CORNERS_TOO = np.ones((3, 3, 3))
@@ -23,19 +23,19 @@ CORNERS_TOO = np.ones((3, 3, 3))
 def without_floaters(
     occupancy: Occupancy,
     solid: Bool[np.ndarray, "x y z"],
-    places: Float[np.ndarray, "p 3"],
+    points_in_grid: Float[np.ndarray, "p 3"],
     space: Space,
 ) -> Occupancy:
     """The occupancy without the pieces of solid cells that are tied to nothing, and without the rim around them.
 
     A piece is tied if there is a known point in it or beside it, or if it reaches the contracted surroundings: what is
-    far away is often seen without any point on it. Where `MOST_FLOATING` is exceeded, everything stays.
+    far away is often seen without any point on it. Where `MAX_FLOATING_FRACTION` is exceeded, everything stays.
 
     Args:
         places: Of known points, in the grid.
     """
     shape = np.array(solid.shape)
-    cell = np.floor((places - occupancy.lower) / occupancy.cell_size)
+    cell = np.floor((points_in_grid - occupancy.lower) / occupancy.cell_size)
     cell = cell[np.all((cell >= 0) & (cell < shape), axis=1)].astype(np.int64)  # nan is not inside
     ties = np.zeros(solid.shape, dtype=bool)
     ties[tuple(cell.T)] = True
@@ -51,6 +51,6 @@ def without_floaters(
     tied[0] = False
     kept = tied[pieces]
     floating = solid & ~kept
-    if np.count_nonzero(floating) > MOST_FLOATING * np.count_nonzero(solid):
+    if np.count_nonzero(floating) > MAX_FLOATING_FRACTION * np.count_nonzero(solid):
         return occupancy
     return Occupancy(occupancy.lower, occupancy.cell_size, occupancy.cells & ~(grown_by_one(floating) & ~kept))

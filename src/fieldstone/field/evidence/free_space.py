@@ -19,10 +19,10 @@ from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.scene.rays import pixel_centers
 
-FREE_SHARE = 0.7
+FREE_FRACTION = 0.7
 """Space is empty up to this share of the distance of known points: what has none may stand before them."""
 
-PROBABLE_SHARE = 0.92
+FREE_LOSS_FRACTION = 0.92
 """And probably up to this share of the least distance of the points around."""
 
 NEIGHBOURS = 8
@@ -41,7 +41,7 @@ NEAR_PERCENT = 90.0
 """Percentile of the distances of its points up to which a place is near to a photo."""
 
 AROUND_PERCENT = 5.0
-"""Up to `FREE_SHARE` of this percentile of the distances of its points, a place is around a photo."""
+"""Up to `FREE_FRACTION` of this percentile of the distances of its points, a place is around a photo."""
 
 MIN_SEEN = 20
 """Fewer points of a photo say nothing of its space."""
@@ -66,21 +66,21 @@ def carve_free_space(
         seen: By name of the photo, in the world.
     """
     corners = corners_in_world(occupancy, frame, space)
-    places, shape = corners.reshape(-1, 3), corners.shape[:3]
+    positions, shape = corners.reshape(-1, 3), corners.shape[:3]
 
     def of_photo(image: PosedImage) -> tuple[np.ndarray, ...]:
         """Cells that are free, that the photo sees, that it sees from near, that it sees a part of, and around it."""
-        away = np.linalg.norm(places - image.cam_from_world.target_origin_in_source(), axis=1)
-        pixels = image_from_cam(image.camera, image.cam_from_world.apply(places))
+        away = np.linalg.norm(positions - image.cam_from_world.target_origin_in_source(), axis=1)
+        pixels = image_from_cam(image.camera, image.cam_from_world.apply(positions))
         # nan, behind the camera, is not inside.
         inside = np.all((pixels >= 0) & (pixels <= [image.camera.width, image.camera.height]), axis=1)
-        free, near, around = np.zeros((3, len(places)), dtype=bool)
+        free, near, around = np.zeros((3, len(positions)), dtype=bool)
         points = seen.get(image.name)
         if points is not None and len(points.xyz) >= MIN_SEEN:
             distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
-            free[inside] = away[inside] < FREE_SHARE * least_distance(image, points.xyz, distances, pixels[inside])
+            free[inside] = away[inside] < FREE_FRACTION * least_distance(image, points.xyz, distances, pixels[inside])
             near = inside & (away < np.percentile(distances, NEAR_PERCENT))
-            around = away < FREE_SHARE * np.percentile(distances, AROUND_PERCENT)
+            around = away < FREE_FRACTION * np.percentile(distances, AROUND_PERCENT)
         # A photo may see a part of a cell, but none of its corners.
         spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
         (left, right), (top, bottom) = spans
@@ -105,7 +105,7 @@ def carve_free_space(
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
 
 
-def probably_free(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable[[PosedImage], Float[np.ndarray, "p"]]:
+def free_distances(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable[[PosedImage], Float[np.ndarray, "p"]]:
     """How far every pixel of a photo probably sees, in the frame; 0 where too little is known.
 
     Unlike in `carve_free_space`, something may stand there: the distance is nearly that of the points around it.
@@ -117,7 +117,7 @@ def probably_free(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable
             return np.zeros(camera.width * camera.height, dtype=np.float32)
         distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
         least = least_distance(image, points.xyz, distances, pixel_centers(camera.width, camera.height))
-        return (PROBABLE_SHARE * frame.normalized_from_world.scale * least).astype(np.float32)
+        return (FREE_LOSS_FRACTION * frame.normalized_from_world.scale * least).astype(np.float32)
 
     return of_photo
 

@@ -46,7 +46,7 @@ LEAST_SIGMA = 0.004
 
 
 @dataclass(frozen=True, eq=False)
-class MovablePhoto:
+class RefinablePhoto:
     """A small photo at the pose that it was given."""
 
     image: PosedImage
@@ -54,9 +54,9 @@ class MovablePhoto:
     """What the known points say of the pose: the inverse covariance of a tangent (omega, v), see `Rigid3.retract`."""
 
 
-def movable_photos(
+def refinable_photos(
     images: tuple[PosedImage, ...], frame: FieldFrame, seen: Mapping[str, SeenPoints] | None
-) -> tuple[MovablePhoto, ...]:
+) -> tuple[RefinablePhoto, ...]:
     """The photos as they are compared, and what holds them.
 
     Args:
@@ -72,7 +72,7 @@ def movable_photos(
             points, sigma_px = known.xyz, SIGMA_PX
         J = pixels_by_pose(image.camera, image.cam_from_world, points)
         J = J[np.isfinite(J).all(axis=(1, 2))]
-        out.append(MovablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
+        out.append(RefinablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
     return tuple(out)
 
 
@@ -86,8 +86,8 @@ def pixels_by_pose(
 
 
 def refined(
-    photos: Sequence[MovablePhoto],
-    moved: Float[np.ndarray, "v 6"],
+    photos: Sequence[RefinablePhoto],
+    pose_deltas: Float[np.ndarray, "v 6"],
     render_rays: RayRenderer,
     gains: Float[np.ndarray, "v 3"],
     background: Float[np.ndarray, "3"],
@@ -103,17 +103,17 @@ def refined(
     Returns:
         The tangents after the step.
     """
-    out = moved.copy()
+    out = pose_deltas.copy()
     for v, photo in enumerate(photos):
         target = photo.image.composited(background).reshape(-1, 3)
-        here = _compare(photo, moved[v], render_rays, gains[v], target)
-        step = _step(photo, moved[v], here)
+        here = _compare(photo, pose_deltas[v], render_rays, gains[v], target)
+        step = _step(photo, pose_deltas[v], here)
         if step is None:
             continue
-        there = _compare(photo, moved[v] + step, render_rays, gains[v], target)
+        there = _compare(photo, pose_deltas[v] + step, render_rays, gains[v], target)
         both = here.usable & there.usable
         sigma = here.sigma
-        if _cost(there, both, sigma, photo, moved[v] + step) < _cost(here, both, sigma, photo, moved[v]):
+        if _cost(there, both, sigma, photo, pose_deltas[v] + step) < _cost(here, both, sigma, photo, pose_deltas[v]):
             out[v] += step
     return out
 
@@ -129,9 +129,9 @@ def at_surfaces(render_rays: RayRenderer, far: float) -> RayRenderer:
     return render
 
 
-def moved_images(images: Sequence[PosedImage], moved: Float[np.ndarray, "v 6"]) -> tuple[PosedImage, ...]:
+def refined_images(images: Sequence[PosedImage], pose_deltas: Float[np.ndarray, "v 6"]) -> tuple[PosedImage, ...]:
     """The photos at their refined poses."""
-    pairs = zip(images, moved, strict=True)
+    pairs = zip(images, pose_deltas, strict=True)
     return tuple(replace(image, cam_from_world=image.cam_from_world.retract(tangent)) for image, tangent in pairs)
 
 
@@ -154,7 +154,7 @@ class _Comparison:
 
 
 def _compare(
-    photo: MovablePhoto, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
+    photo: RefinablePhoto, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
 ) -> _Comparison:
     image = photo.image
     pose = image.cam_from_world.retract(tangent)
@@ -186,7 +186,7 @@ def _inside_surfaces(camera: Camera, rendered: RenderedRays) -> Bool[np.ndarray,
     return (farthest < MAX_DEPTH_RATIO * nearest).reshape(-1)
 
 
-def _step(photo: MovablePhoto, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
+def _step(photo: RefinablePhoto, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
     """The minimum of the linearised squares; None where nothing can be compared."""
     camera = photo.image.camera
     grid = here.shown.reshape(camera.height, camera.width, 3)
@@ -209,7 +209,7 @@ def _step(photo: MovablePhoto, tangent: np.ndarray, here: _Comparison) -> np.nda
         return None
 
 
-def _cost(at: _Comparison, usable: np.ndarray, sigma: float, photo: MovablePhoto, tangent: np.ndarray) -> float:
+def _cost(at: _Comparison, usable: np.ndarray, sigma: float, photo: RefinablePhoto, tangent: np.ndarray) -> float:
     """Robust mean of the squared differences, as many as there are, and what the known points pay."""
     r = at.residual[usable] / sigma
     return float(0.5 * np.log1p(r**2).sum() / SAME_ERROR + 0.5 * tangent @ photo.information @ tangent)

@@ -11,7 +11,7 @@ from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, poses_in_frame
 from fieldstone.field.base.space import Space, along_rays
 from fieldstone.field.grid.rays import RayTable, coprime_stride
-from fieldstone.field.grid.terms_numba import PointRays
+from fieldstone.field.grid.terms_numba import SparseDepths
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -59,22 +59,28 @@ def seen_points(model: Reconstruction) -> dict[str, SeenPoints]:
     }
 
 
-def no_known_rays() -> tuple[RayTable, PointRays]:
-    """Nothing known."""
+def no_sparse_depth_rays() -> tuple[RayTable, SparseDepths]:
+    """No such rays."""
     empty = np.zeros((0, 3), dtype=np.float32)
     table = RayTable(
-        np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8), empty,
-        np.zeros((0, 3, 3), np.float32), empty, empty[:, 0].copy(), 1,
-    )  # fmt: skip
-    return table, PointRays(empty[:, 0].copy(), empty[:, 0].copy(), empty[:, 0].copy())
+        image=np.zeros(0, np.int32),
+        bearing=np.zeros(0, np.int32),
+        rgba=np.zeros((0, 4), np.uint8),
+        bearings=empty,
+        rotations=np.zeros((0, 3, 3), np.float32),
+        centers=empty,
+        free_distance=empty[:, 0].copy(),
+        stride=1,
+    )
+    return table, SparseDepths(empty[:, 0].copy(), empty[:, 0].copy(), empty[:, 0].copy())
 
 
-def known_rays(
+def sparse_depth_rays(
     images: Sequence[PosedImage],
     frame: FieldFrame,
     seen: Mapping[str, SeenPoints],
     space: Space,
-) -> tuple[RayTable, PointRays]:
+) -> tuple[RayTable, SparseDepths]:
     """Rays from photos to the points that they see, the colours there, and how far along each ray its point lies.
 
     Args:
@@ -102,15 +108,21 @@ def known_rays(
         bearings = in_cam[rows] / np.linalg.norm(in_cam[rows], axis=1, keepdims=True)
         parts.append((np.full(len(rows), v)[good], bearings[good], rgba[good], along[:, good]))
     if not sum(len(part[0]) for part in parts):
-        return no_known_rays()
+        return no_sparse_depth_rays()
     image, bearings, rgba = (np.concatenate([part[k] for part in parts]) for k in range(3))
     along = np.concatenate([part[3] for part in parts], axis=1).astype(np.float32)
     rows = np.arange(len(image), dtype=np.int32)
     table = RayTable(
-        image.astype(np.int32), rows, rgba, bearings.astype(np.float32), rotations, centers,
-        np.zeros(len(image), dtype=np.float32), coprime_stride(len(image)),
-    )  # fmt: skip
-    return table, PointRays(*along)
+        image=image.astype(np.int32),
+        bearing=rows,
+        rgba=rgba,
+        bearings=bearings.astype(np.float32),
+        rotations=rotations,
+        centers=centers,
+        free_distance=np.zeros(len(image), dtype=np.float32),
+        stride=coprime_stride(len(image)),
+    )
+    return table, SparseDepths(*along)
 
 
 def _colors(pixels: np.ndarray, at_px: Float[np.ndarray, "n 2"]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The decoder of the fast field: interpolated features and a viewing direction to a colour.
+"""The decoder of the grid field: interpolated features and a viewing direction to a colour.
 
     hidden = max(0, F f + D basis(d) + b),    rgb = sigmoid(C hidden + c)
 

@@ -24,7 +24,7 @@ from fieldstone.field.grid.simd_numba import (
     store8,
     sum8,
     where_nonzero8,
-)  # fmt: skip
+)
 
 GROUP = 64
 """Samples whose gradients are summed up before they are added to the gradient of the weights."""
@@ -33,7 +33,7 @@ GROUP = 64
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def _basis(directions, ray, out):
-    """`fast_decoder.direction_basis` of one direction."""
+    """`decoder.direction_basis` of one direction."""
     x, y, z = at(directions, ray * 3), at(directions, ray * 3 + 1), at(directions, ray * 3 + 2)
     out[0], out[1], out[2] = x, y, z
     out[3], out[4], out[5] = x * y, y * z, x * z
@@ -63,7 +63,7 @@ def _sigmoid(x):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def decode_numba(decoder, num_samples, features, width, used, ray, per_ray, hidden, rgb):
-    """`fast_decoder.decode`; keeps the hidden layer for `decode_backward`.
+    """`decoder.decode`; keeps the hidden layer for `decode_backward`.
 
     features: (s, width), of which the first `used` count. ray: (s,) row of each sample in per_ray (r, hidden).
     hidden: (s, hidden). rgb: (s, 3).
@@ -112,7 +112,7 @@ def decode_backward(
     directions,
     hidden,
     d_color,
-    d_raw,
+    d_log_density,
     d_per_ray,
     grad,
 ):
@@ -152,8 +152,8 @@ def decode_backward(
                 store8(features, i * width + k, d_i)
                 store8(features, j * width + k, d_j)
             for level in range(0, used, 4):
-                features[i * width + level] = at(d_raw, i)
-                features[j * width + level] = at(d_raw, j)
+                features[i * width + level] = at(d_log_density, i)
+                features[j * width + level] = at(d_log_density, j)
     _rays_backward(num_rays, directions, d_per_ray, grad)
 
 

@@ -1,4 +1,4 @@
-"""Exposure and white balance of every photo, learned with the fast field: one gain a channel.
+"""Exposure and white balance of every photo, learned with the grid field: one gain a channel.
 
 A camera that chooses exposure and white balance for each photo shows one surface in different colours. A photo v then
 shows exp(theta_v) C, channel by channel, of the colours C of the field. What all photos share stays with the field:
@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fieldstone.field.base.adam import adam_estimates
 from fieldstone.geometry.rigid3 import Rigid3
 
-MEMORY = (0.9, 0.99)
+BETAS = (0.9, 0.99)
 
 SHRINK = 0.05
 """Pull towards gain 1, as a share of the learning rate: photos that say nothing keep what the camera gave."""
@@ -27,11 +28,11 @@ NEAREST = 2
 
 
 class Exposure(NamedTuple):
-    """theta, and the running means of Adam; float32 (3 v), photo by photo. Updated in place."""
+    """theta, and the moments of Adam; float32 (3 v), photo by photo. Updated in place."""
 
     log_gain: np.ndarray
-    mean: np.ndarray
-    square: np.ndarray
+    first_moment: np.ndarray
+    second_moment: np.ndarray
 
 
 def unit_exposure(num_images: int) -> Exposure:
@@ -51,18 +52,16 @@ def step_exposure(exposure: Exposure, gradients: Sequence[Float[np.ndarray, "n"]
         count: Number of this step, from 1.
 
     Source:
-        `kingma2015`, algorithm 1; `loshchilov2019`, algorithm 2, for the pull beside the gradient.
+        `loshchilov2019`, algorithm 2: the pull stands beside the gradient.
     """
     gradient = np.zeros_like(exposure.log_gain)
     for part in gradients:
         gradient += part
-    memory, square_memory = (np.float32(m) for m in MEMORY)
-    exposure.mean[:] = memory * exposure.mean + (1 - memory) * gradient
-    exposure.square[:] = square_memory * exposure.square + (1 - square_memory) * gradient * gradient
-    first, second = np.float32(1 - MEMORY[0] ** count), np.float32(1 - MEMORY[1] ** count)
-    step = (exposure.mean / first) / (np.sqrt(exposure.square / second) + np.float32(EPSILON))
+    numerator, denominator = adam_estimates(
+        exposure.first_moment, exposure.second_moment, gradient, count, betas=BETAS, epsilon=EPSILON
+    )
     theta = exposure.log_gain
-    theta -= np.float32(rate) * (step + np.float32(SHRINK) * theta)
+    theta -= np.float32(rate) * (numerator / denominator + np.float32(SHRINK) * theta)
     by_image = theta.reshape(-1, 3)
     by_image -= by_image.mean(axis=0, dtype=np.float64).astype(np.float32)
 
@@ -79,9 +78,9 @@ def gain_at(log_gain: Float[np.ndarray, "v 3"], cam_from_world: Rigid3, poses: R
     """
     centers = poses.target_origin_in_source()
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()) or 1.0
-    away = np.linalg.norm(centers - cam_from_world.target_origin_in_source(), axis=1) / spread
-    turned = np.linalg.norm(poses.R[:, 2] - cam_from_world.R[2], axis=1)
-    distance = np.hypot(away, turned)
+    offset = np.linalg.norm(centers - cam_from_world.target_origin_in_source(), axis=1) / spread
+    rotated = np.linalg.norm(poses.R[:, 2] - cam_from_world.R[2], axis=1)
+    distance = np.hypot(offset, rotated)
     nearest = np.argsort(distance, kind="stable")[:NEAREST]
     weights = 1.0 / np.maximum(distance[nearest], 1e-3)
     return np.exp(weights @ log_gain[nearest] / weights.sum())

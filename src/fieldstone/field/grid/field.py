@@ -1,64 +1,37 @@
-"""The fast field: feature grids, a small decoder and an occupancy, as one value that renders and can be saved."""
+"""The grid field: feature grids, a small decoder and an occupancy, as one value that can be saved."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from queue import Empty, SimpleQueue
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.errors import InputError
 from fieldstone.field.base.projection import Projection
-from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays
-from fieldstone.field.base.space import (
-    Space,
-    box_space,
-    contracted_space,
-    expected_distance,
-    marched_rays,
-    projective_space,
-)
+from fieldstone.field.base.space import Space, box_space, contracted_space, projective_space
 from fieldstone.field.grid.decoder import HIDDEN, Decoder, decode
-from fieldstone.field.grid.decoder_numba import decode_directions, decode_numba
 from fieldstone.field.grid.interpolation_numba import interpolate_numba
 from fieldstone.field.grid.layout import CHANNELS, GridLayout, grid_layout, interpolate
-from fieldstone.field.grid.march_numba import (
-    MAX_RAW,
-    MIN_RAW,
-    Box,
-    March,
-    Samples,
-    composite_numba,
-    march_rays,
-)  # fmt: skip
+from fieldstone.field.grid.march_numba import MAX_LOG_DENSITY, MIN_LOG_DENSITY, Box, March
 from fieldstone.field.grid.occupancy import Occupancy, cell_distances, in_bricks
-from fieldstone.scene.rays import Rays
 
 REFERENCE_CELLS = 128
 """Density 1 takes the share 1 - 1/e of the light on 1/128 of the longest side of the box."""
 
-RENDER_MIN_WEIGHT, RENDER_MIN_LIGHT = 4e-3, 1e-2
-"""As where open scenes are learned. Lego at 400x400: 0.008 dB less than with 1e-3 and 3e-3, 1.13 times as fast."""
-
 FOREVER = np.float32(1e9)
-
-RAYS_PER_TILE = 1024
-SAMPLES_PER_TILE = 8192
 
 
 @dataclass(frozen=True, eq=False)
-class FastField:
+class GridField:
     """What training has found. Lengths are those of the field's frame (normalised)."""
 
     layout: GridLayout
     table: Float[np.ndarray, "t"]
     decoder: Decoder
     occupancy: Occupancy
-    raw_offset: float
+    density_bias: float
     step_cells: float
     near: float
     """Distance from the camera at which rays begin."""
@@ -74,13 +47,17 @@ class FastField:
         """The occupancy as the kernels take it."""
         return occupancy_box(self.occupancy, self.layout.extent, self.space)
 
-    def march(self, min_weight: float, min_light: float) -> March:
+    def march(self, min_weight: float, early_stop_eps: float) -> March:
         """How rays are sampled, with the thresholds of the caller."""
         step = float(self.layout.spacings[-1]) * self.step_cells
         return March(
-            np.float32(step), np.float32(self.raw_offset), np.float32(self.step_depth),
-            np.float32(min_weight), np.float32(min_light), np.float32(self.near),
-        )  # fmt: skip
+            step=np.float32(step),
+            density_bias=np.float32(self.density_bias),
+            depth_scale=np.float32(self.step_depth),
+            min_weight=np.float32(min_weight),
+            early_stop_eps=np.float32(early_stop_eps),
+            near=np.float32(self.near),
+        )
 
     @property
     def step_depth(self) -> float:
@@ -100,9 +77,12 @@ class FastField:
         inside[inside] = self.occupancy.cells[tuple(cell[inside].T)]
         grid = self.layout.arrays(self.table)
         values = interpolate_numba(grid, np.ascontiguousarray(local[inside], dtype=np.float32))
-        raw = self.raw_offset + values[:, ::CHANNELS].sum(axis=1)
+        log_density = self.density_bias + values[:, ::CHANNELS].sum(axis=1)
         out = np.zeros(len(points))
-        out[inside] = np.where(raw > MIN_RAW, np.exp(np.minimum(raw, MAX_RAW)), 0.0) / self.reference_length
+        out[inside] = (
+            np.where(log_density > MIN_LOG_DENSITY, np.exp(np.minimum(log_density, MAX_LOG_DENSITY)), 0.0)
+            / self.reference_length
+        )
         return out
 
     def color(self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -124,7 +104,7 @@ class FastField:
             "cells": np.packbits(self.occupancy.cells.reshape(-1)),
             "cells_shape": np.array(self.occupancy.cells.shape, dtype=np.int64),
             "cells_box": np.append(self.occupancy.lower, self.occupancy.cell_size),
-            "sampling": np.array([self.raw_offset, self.step_cells, float(self.space.is_contracted), self.near]),
+            "sampling": np.array([self.density_bias, self.step_cells, float(self.space.is_contracted), self.near]),
             "projection": np.array([self.space.is_projective, projection.near, projection.depth], np.float32),
             "projection_R": projection.R,
             "projection_center": projection.center,
@@ -139,17 +119,17 @@ def occupancy_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], space: S
         extent: Of the grids: the last cells may reach beyond it, samples must not.
     """
     return Box(
-        occupancy.lower.astype(np.float32),
-        extent.astype(np.float32),
-        in_bricks(cell_distances(occupancy.cells)),
-        np.array(occupancy.cells.shape, dtype=np.int64),
-        np.float32(occupancy.cell_size),
-        space,
+        lower=occupancy.lower.astype(np.float32),
+        extent=extent.astype(np.float32),
+        distance=in_bricks(cell_distances(occupancy.cells)),
+        cells=np.array(occupancy.cells.shape, dtype=np.int64),
+        cell_size=np.float32(occupancy.cell_size),
+        space=space,
     )
 
 
-def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> FastField:
-    """The field of `FastField.to_tensors`.
+def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> GridField:
+    """The field of `GridField.to_tensors`.
 
     Raises:
         InputError: An array is missing or has the wrong shape.
@@ -161,13 +141,22 @@ def field_from_tensors(tensors: Mapping[str, np.ndarray]) -> FastField:
         occupancy = Occupancy(lower_and_size[:3].copy(), float(lower_and_size[3]), cells)
         layout = grid_layout(tensors["extent"], tuple(tensors["resolutions"].tolist()))
         decoder = Decoder(**{name: tensors[f"decoder_{name}"].copy() for name in Decoder._fields})
-        raw_offset, step_cells, _, near = tensors["sampling"].tolist()
+        density_bias, step_cells, _, near = tensors["sampling"].tolist()
         empty = np.zeros(layout.num_values, dtype=np.float32)
         space = _space_from_tensors(tensors)
-        field = FastField(layout, empty, decoder, occupancy, raw_offset, step_cells, near, space)
+        field = GridField(
+            layout=layout,
+            table=empty,
+            decoder=decoder,
+            occupancy=occupancy,
+            density_bias=density_bias,
+            step_cells=step_cells,
+            near=near,
+            space=space,
+        )
         return expand(field, tensors["grid"])
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise InputError(f"this checkpoint does not hold a fast field ({error}); delete it and train again") from error
+        raise InputError(f"this checkpoint does not hold a grid field ({error}); delete it and train again") from error
 
 
 def _space_from_tensors(tensors: Mapping[str, np.ndarray]) -> Space:
@@ -179,7 +168,7 @@ def _space_from_tensors(tensors: Mapping[str, np.ndarray]) -> Space:
     return contracted_space(0.25 * float(np.max(tensors["extent"]))) if contracted else box_space()
 
 
-def reachable_vertices(field: FastField) -> Bool[np.ndarray, "v"]:
+def reachable_vertices(field: GridField) -> Bool[np.ndarray, "v"]:
     """Which vertices of all levels, in the order of the table, an occupied cell needs."""
     parts = []
     cells, cell_size = field.occupancy.cells, field.occupancy.cell_size
@@ -202,7 +191,7 @@ def _vertices(layout: GridLayout, table: np.ndarray) -> list[np.ndarray]:
     return [layout.level(table, level).reshape(-1, CHANNELS) for level in range(layout.num_levels)]
 
 
-def clear_unreachable(field: FastField, *tables: Float[np.ndarray, "t"]) -> None:
+def clear_unreachable(field: GridField, *tables: Float[np.ndarray, "t"]) -> None:
     """Set what no ray can reach to 0, in tables laid out like the field's: a checkpoint does not keep it."""
     reachable, start = reachable_vertices(field), 0
     for level in range(field.layout.num_levels):
@@ -214,7 +203,7 @@ def clear_unreachable(field: FastField, *tables: Float[np.ndarray, "t"]) -> None
 
 
 def compress(
-    field: FastField, table: Float[np.ndarray, "t"], reachable: Bool[np.ndarray, "v"]
+    field: GridField, table: Float[np.ndarray, "t"], reachable: Bool[np.ndarray, "v"]
 ) -> Float[np.ndarray, "k 4"]:
     """The reachable vertices of a table laid out like the field's."""
     parts, start = [], 0
@@ -224,7 +213,7 @@ def compress(
     return np.concatenate(parts)
 
 
-def expand(field: FastField, vertices: Float[np.ndarray, "v 4"]) -> FastField:
+def expand(field: GridField, vertices: Float[np.ndarray, "v 4"]) -> GridField:
     """The field with its table filled from `compress`; other vertices are 0."""
     table = np.zeros(field.layout.num_values, dtype=np.float32)
     reachable, start, row = reachable_vertices(field), 0, 0
@@ -234,108 +223,5 @@ def expand(field: FastField, vertices: Float[np.ndarray, "v 4"]) -> FastField:
         level[here] = vertices[row : row + count]
         start, row = start + len(level), row + count
     if row != len(vertices):
-        raise ValueError(f"{len(vertices)} vertices for {row} places")
+        raise ValueError(f"{len(vertices)} vertices were stored for {row} that can be reached")
     return replace(field, table=table)
-
-
-class _Tile(NamedTuple):
-    """Room for one tile of rays; one per thread at work."""
-
-    samples: Samples
-    jitter: np.ndarray
-    first: np.ndarray
-    passed: np.ndarray
-    per_ray: np.ndarray
-    hidden: np.ndarray
-    rgb: np.ndarray
-
-
-def _room_for_tile(width: int) -> _Tile:
-    """Rays begin half a step after the box."""
-    return _Tile(
-        room_for_samples(SAMPLES_PER_TILE, width),
-        np.full(RAYS_PER_TILE, 0.5, np.float32),
-        np.zeros(RAYS_PER_TILE + 1, np.int64),
-        np.empty(RAYS_PER_TILE, np.float32),
-        np.empty(RAYS_PER_TILE * HIDDEN, np.float32),
-        np.empty(SAMPLES_PER_TILE * HIDDEN, np.float32),
-        np.empty(SAMPLES_PER_TILE * 3, np.float32),
-    )
-
-
-def room_for_samples(capacity: int, width: int) -> Samples:
-    """Empty arrays for so many samples."""
-
-    def floats(count: int) -> np.ndarray:
-        return np.zeros(count, dtype=np.float32)
-
-    return Samples(
-        floats(3 * capacity), floats(capacity), floats(capacity), floats(capacity), floats(capacity),
-        np.zeros(capacity, dtype=np.int32), floats((capacity + 1) * width),
-    )  # fmt: skip
-
-
-def renderer(
-    field: FastField,
-    frame: FieldFrame,
-    executor: Executor,
-    *,
-    min_weight: float = RENDER_MIN_WEIGHT,
-    min_light: float = RENDER_MIN_LIGHT,
-) -> RayRenderer:
-    """Renders rays in normalised coordinates, tile by tile on the threads of the executor."""
-    grid, box, march = field.layout.arrays(field.table), field.box(), field.march(min_weight, min_light)
-    width, used = field.width, 4 * field.layout.num_levels
-    far = np.float32(frame.far)
-
-    idle: SimpleQueue[_Tile] = SimpleQueue()
-
-    def render_tile(rays: Rays) -> RenderedRays:
-        try:
-            tile = idle.get_nowait()
-        except Empty:
-            tile = _room_for_tile(width)
-        try:
-            return render_with(tile, rays)
-        finally:
-            idle.put(tile)
-
-    def render_with(tile: _Tile, rays: Rays) -> RenderedRays:
-        count = len(rays)
-        views = np.ascontiguousarray(rays.directions, dtype=np.float32)
-        origins, directions, lengths = marched_rays(field.space, rays.origins, rays.directions)
-        origins = np.ascontiguousarray(origins, dtype=np.float32)
-        directions = np.ascontiguousarray(directions, dtype=np.float32)
-        color, depth = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-        opacity = np.empty(count, np.float32)
-        samples, jitter, first, passed, per_ray, hidden, rgb = tile
-        background = np.tile(frame.background.astype(np.float32), count)
-        done = 0
-        while done < count:
-            o, d = origins[done:].reshape(-1), directions[done:].reshape(-1)
-            num_rays, n, _ = march_rays(
-                grid, box, march, o, d, jitter, FOREVER, count - done, width, samples, first, passed
-            )
-            decode_directions(field.decoder, views[done:].reshape(-1), num_rays, per_ray)
-            decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
-            rows = slice(done, done + num_rays)
-            composite_numba(
-                samples, num_rays, first, passed, far, background, rgb, color[rows], depth[rows], opacity[rows]
-            )
-            done += num_rays
-        depth = expected_distance(field.space, rays.origins, rays.directions, lengths, depth, opacity, far)
-        return RenderedRays(color, depth.astype(np.float32), opacity)
-
-    def render(rays: Rays, /) -> RenderedRays:
-        rows = [slice(start, start + RAYS_PER_TILE) for start in range(0, len(rays), RAYS_PER_TILE)]
-        tiles = [Rays(rays.origins[r], rays.directions[r], rays.pixel_radius[r]) for r in rows]
-        parts = list(executor.map(render_tile, tiles))
-        if not parts:
-            return RenderedRays(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-        return RenderedRays(
-            np.concatenate([part.rgb for part in parts]),
-            np.concatenate([part.depth for part in parts]),
-            np.concatenate([part.opacity for part in parts]),
-        )
-
-    return render

@@ -32,7 +32,7 @@ from fieldstone.field.grid.simd_numba import (
     sub8,
     twice8,
     where_nonzero8,
-)  # fmt: skip
+)
 
 BLOCK = 16
 """Numbers in a block of the table, 64 bytes: what `step_touched` looks at as a whole."""
@@ -44,9 +44,9 @@ AHEAD = 6
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def interpolate_point_numba(grid, x, y, z, out, start):
-    """`fast_grid.interpolate` of one point into out[start:start + 4 l]; returns the sum of the raw densities."""
+    """`layout.interpolate` of one point into out[start:start + 4 l]; returns the sum of the raw densities."""
     one = np.float32(1)
-    raw = np.float32(0)
+    log_density = np.float32(0)
     for level in range(grid.per_unit.shape[0]):
         scale = at(grid.per_unit, level)
         row = at(grid.sizes, level * 3 + 2) * 4
@@ -61,8 +61,8 @@ def interpolate_point_numba(grid, x, y, z, out, start):
         edges = fma8(spread8(one - fu), near, mul8(spread8(fu), far))
         value = fold8(mul8(edges, halves8(one - fw, fw)))
         store4(out, start + level * 4, value)
-        raw += first_lane(value)
-    return raw
+        log_density += first_lane(value)
+    return log_density
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -82,7 +82,7 @@ def prefetch_point(grid, x, y, z, level):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def interpolate_numba(grid, points):  # (n, 3) -> (n, 4 l)
-    """`fast_grid.interpolate` in float32."""
+    """`layout.interpolate` in float32."""
     width = 4 * grid.per_unit.shape[0]
     out = np.empty((points.shape[0], width), np.float32)
     flat = out.reshape(-1)
@@ -133,7 +133,7 @@ def add_gradient(grid, level, half, counts, capacity, positions, gradient, width
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def step_touched(table, velocity, gradient, touched, first, last, rates, kept, decay, epsilon):
+def step_touched(table, mean_square, gradient, touched, first, last, rates, decay_factors, decay, epsilon):
     """One RMSprop step of the values with a gradient in blocks `first` to `last` (multiples of 8); clears both.
 
     v <- decay v + (1 - decay) g^2,   p <- kept p - rate g / (sqrt(v) + epsilon).
@@ -144,8 +144,8 @@ def step_touched(table, velocity, gradient, touched, first, last, rates, kept, d
     Source:
         `tieleman2012`; kept as in `loshchilov2019`, algorithm 2. Departure: no step where the gradient is exactly 0.
     """
-    zero, keep, new, tiny = spread8(0), spread8(decay), spread8(np.float32(1) - decay), spread8(epsilon)
-    rate, keep_value = load8(rates, 0), load8(kept, 0)
+    zero, memory, new, tiny = spread8(0), spread8(decay), spread8(np.float32(1) - decay), spread8(epsilon)
+    rate, factor = load8(rates, 0), load8(decay_factors, 0)
     blocks = np.empty(last - first + AHEAD, np.int64)
     count = 0
     words = touched.view(np.uint64)
@@ -159,14 +159,14 @@ def step_touched(table, velocity, gradient, touched, first, last, rates, kept, d
     for n in range(count):
         ahead = at(blocks, n + AHEAD)
         prefetch(table, ahead)
-        prefetch(velocity, ahead)
+        prefetch(mean_square, ahead)
         prefetch(gradient, ahead)
         for part in range(2):
             i = at(blocks, n) + part * 8
-            g, v, p = load8(gradient, i), load8(velocity, i), load8(table, i)
-            v_new = fma8(keep, v, mul8(new, mul8(g, g)))
-            p_new = sub8(mul8(keep_value, p), div8(mul8(rate, g), add8(sqrt8(v_new), tiny)))
-            store8(velocity, i, where_nonzero8(g, v_new, v))
+            g, v, p = load8(gradient, i), load8(mean_square, i), load8(table, i)
+            v_new = fma8(memory, v, mul8(new, mul8(g, g)))
+            p_new = sub8(mul8(factor, p), div8(mul8(rate, g), add8(sqrt8(v_new), tiny)))
+            store8(mean_square, i, where_nonzero8(g, v_new, v))
             store8(table, i, where_nonzero8(g, p_new, p))
             store8(gradient, i, zero)
 
@@ -174,7 +174,7 @@ def step_touched(table, velocity, gradient, touched, first, last, rates, kept, d
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def step_by_sample(
-    grid, level, half, counts, capacity, positions, gradient, width, velocity, rates, kept, decay, epsilon
+    grid, level, half, counts, capacity, positions, gradient, width, mean_square, rates, decay_factors, decay, epsilon
 ):
     """The step of `step_touched` for every sample at once, without a gradient table, on one half of one level.
 
@@ -182,25 +182,25 @@ def step_by_sample(
     writes value and velocity of 32 bytes per edge where the two-pass way also fills, reads and clears a gradient.
     """
     one = np.float32(1)
-    keep, new, tiny = spread8(decay), spread8(one - decay), spread8(epsilon)
-    rate, keep_value = load8(rates, 0), load8(kept, 0)
+    memory, new, tiny = spread8(decay), spread8(one - decay), spread8(epsilon)
+    rate, factor = load8(rates, 0), load8(decay_factors, 0)
     for chunk in range(counts.shape[0]):
         end = chunk * capacity + counts[chunk]
         for sample in range(chunk * capacity, end):
             b, row, weight, fv, fw = _edge(grid, level, half, positions, min(sample + AHEAD, end - 1))
             prefetch(grid.table, b)
             prefetch(grid.table, b + row)
-            prefetch(velocity, b)
-            prefetch(velocity, b + row)
+            prefetch(mean_square, b)
+            prefetch(mean_square, b + row)
             b, row, weight, fv, fw = _edge(grid, level, half, positions, sample)
             shared = mul8(
                 halves8((one - fw) * weight, fw * weight), twice8(load4(gradient, sample * width + level * 4))
             )
             for _ in range(2):
                 g = mul8(spread8(one - fv), shared)
-                v = fma8(keep, load8(velocity, b), mul8(new, mul8(g, g)))
-                store8(velocity, b, v)
-                p = mul8(keep_value, load8(grid.table, b))
+                v = fma8(memory, load8(mean_square, b), mul8(new, mul8(g, g)))
+                store8(mean_square, b, v)
+                p = mul8(factor, load8(grid.table, b))
                 store8(grid.table, b, sub8(p, div8(mul8(rate, g), add8(sqrt8(v), tiny))))
                 b += row
                 fv = one - fv

@@ -1,4 +1,4 @@
-"""The feature grids of the fast field: dense vertex grids of doubling resolution over one box.
+"""The feature grids of the grid field: dense vertex grids of doubling resolution over one box.
 
 Each vertex holds four numbers: a share of the raw density and three colour features. A point takes the trilinear
 mean of the eight vertices around it on every level. Raw densities add up over the levels, so the coarse ones move

@@ -119,7 +119,7 @@ def grown_by_one(cells: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
 
 
 def in_bricks(values: UInt8[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "n"]:
-    """Values of cells brick by brick, see `fast_march_numba.Box`; the last bricks are filled up with 0."""
+    """Values of cells brick by brick, see `march_numba.Box`; the last bricks are filled up with 0."""
     bricks = -(-np.array(values.shape) // BRICK)
     padded = np.pad(values, [(0, BRICK * n - size) for n, size in zip(bricks.tolist(), values.shape, strict=True)])
     split = padded.reshape(bricks[0], BRICK, bricks[1], BRICK, bricks[2], BRICK)

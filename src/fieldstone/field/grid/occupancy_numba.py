@@ -82,7 +82,7 @@ def rays_that_hit(box, origin, directions, out):  # (3,), (r, 3) -> (r,) uint8
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def used_cells(grid, cells, cell_size, spacing, raw_offset, threshold, first, last):
+def used_cells(grid, cells, cell_size, spacing, density_bias, threshold, first, last):
     """Clear occupied cells in slabs `first` to `last` whose raw density is at most `threshold` at all fine vertices.
 
     cells: (x, y, z) bool. spacing: between the vertices of the finest level; those on the faces count too.
@@ -92,12 +92,12 @@ def used_cells(grid, cells, cell_size, spacing, raw_offset, threshold, first, la
         for j in range(cells.shape[1]):
             for k in range(cells.shape[2]):
                 if cells[i, j, k]:
-                    cells[i, j, k] = _is_used(grid, cell_size, spacing, raw_offset, threshold, i, j, k, row)
+                    cells[i, j, k] = _is_used(grid, cell_size, spacing, density_bias, threshold, i, j, k, row)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _is_used(grid, cell_size, spacing, raw_offset, threshold, i, j, k, row):
+def _is_used(grid, cell_size, spacing, density_bias, threshold, i, j, k, row):
     # One vertex beyond the faces, because its cell of influence reaches into this one.
     x0, x1 = int(i * cell_size / spacing), int((i + 1) * cell_size / spacing) + 1
     y0, y1 = int(j * cell_size / spacing), int((j + 1) * cell_size / spacing) + 1
@@ -108,9 +108,9 @@ def _is_used(grid, cell_size, spacing, raw_offset, threshold, i, j, k, row):
     for x in range(x0, x1 + 1):
         for y in range(y0, y1 + 1):
             for z in range(z0, z1 + 1):
-                raw = interpolate_point_numba(
+                log_density = interpolate_point_numba(
                     grid, np.float32(x * spacing), np.float32(y * spacing), np.float32(z * spacing), row, 0
                 )
-                if raw + raw_offset > threshold:
+                if log_density + density_bias > threshold:
                     return True
     return False

@@ -35,7 +35,7 @@ class RayTable(NamedTuple):
     rotations: np.ndarray
     """float32 (v, 3, 3): box axes from camera axes."""
     centers: np.ndarray
-    free: np.ndarray
+    free_distance: np.ndarray
     """float32 (n): the ray probably meets nothing before this distance; 0 where nothing is known."""
     stride: int
 
@@ -47,13 +47,13 @@ def ray_table(
     executor: Executor,
     *,
     use_alpha: bool = True,
-    free_of: Callable[[PosedImage], Float[np.ndarray, "p"]] | None = None,
+    free_distance_of: Callable[[PosedImage], Float[np.ndarray, "p"]] | None = None,
 ) -> RayTable:
     """The table of all pixels whose rays meet an occupied cell, and some beside them (all, in an open space).
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
-        free_of: How far every pixel of a photo probably sees, see `RayTable.free`.
+        free_of: How far every pixel of a photo probably sees, see `RayTable.free_distance`.
 
     Raises:
         InputError: No ray meets the box.
@@ -74,8 +74,10 @@ def ray_table(
             reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
         rows = np.flatnonzero(reached)
         whole_pixels = _rgba(images[v], frame, use_alpha).view(np.uint32)  # one number each is faster to take
-        free = np.zeros(len(rows), dtype=np.float32) if free_of is None else free_of(images[v])[rows]
-        return (rows + first).astype(np.int32), whole_pixels[rows].view(np.uint8), free
+        free_distance = (
+            np.zeros(len(rows), dtype=np.float32) if free_distance_of is None else free_distance_of(images[v])[rows]
+        )
+        return (rows + first).astype(np.int32), whole_pixels[rows].view(np.uint8), free_distance
 
     parts = list(executor.map(rows_of, range(len(images))))
     counts = [len(rows) for rows, _, _ in parts]
@@ -92,7 +94,7 @@ def ray_table(
         bearings=bearings,
         rotations=rotations,
         centers=centers,
-        free=np.concatenate([free for _, _, free in parts]),
+        free_distance=np.concatenate([free_distance for _, _, free_distance in parts]),
         stride=coprime_stride(total),
     )
 

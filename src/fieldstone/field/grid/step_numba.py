@@ -8,11 +8,14 @@ import numpy as np
 from numba import njit
 
 from fieldstone.field.base.space_numba import marched_ray_numba
+from fieldstone.field.grid.composite_numba import composite_backward
 from fieldstone.field.grid.decoder import Decoder
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
-from fieldstone.field.grid.march_numba import Samples, composite_backward, march_rays
+from fieldstone.field.grid.layout import GridArrays
+from fieldstone.field.grid.march_numba import Box, March, march_rays
+from fieldstone.field.grid.rays import RayTable
 from fieldstone.field.grid.simd_numba import prefetch
-from fieldstone.field.grid.terms_numba import point_terms
+from fieldstone.field.grid.terms_numba import SparseDepths, ray_terms
 
 AHEAD = 16
 """Rays between asking for a row of the table and using it."""
@@ -21,55 +24,45 @@ GRADIENT_SCALE = np.float32(1e-2)
 """Constant factor on all gradients; RMSprop and Adam do not depend on it."""
 
 
-class RayBatch(NamedTuple):
-    """Rays of one chunk, flat."""
+class Model(NamedTuple):
+    """A grid field as a step reads it."""
 
-    origins: np.ndarray
-    directions: np.ndarray
-    """As marched: in the field's own space."""
-    views: np.ndarray
-    """Directions as the camera looks, for the decoder."""
-    target: np.ndarray
+    grid: GridArrays
+    box: Box
+    march: March
+    decoder: Decoder
+    transposed: np.ndarray
+    """`Decoder.feature_weights` as (hidden, width)."""
+    width: int
+    """Interpolated values per sample."""
+
+
+class RaySources(NamedTuple):
+    """Where the rays of a step come from."""
+
+    table: RayTable
+    depth_rays: RayTable
+    """Rays to triangulated points; may be none."""
+    sparse_depths: SparseDepths
+    """Where those points are."""
+    gains: np.ndarray
+    """(v, 3) flat: of each photo and channel."""
     background: np.ndarray
-    image: np.ndarray
-    """Which photo shows the ray."""
-    gain: np.ndarray
-    """Of that photo: how bright it shows each channel."""
-    point: np.ndarray
-    """Row of the known point on the ray, -1 without one."""
-    free: np.ndarray
-    """Distance before which the ray probably meets nothing."""
-    jitter: np.ndarray
-    first: np.ndarray
-    passed: np.ndarray
+    seed: int
 
 
-class Work(NamedTuple):
-    """What the samples and rays of one chunk need on the way, flat."""
+class Draw(NamedTuple):
+    """Which rays one chunk draws, as numbers in the sequences of both tables."""
 
-    per_ray: np.ndarray
-    d_per_ray: np.ndarray
-    hidden: np.ndarray
-    rgb: np.ndarray
-    d_color: np.ndarray
-    d_raw: np.ndarray
-    d_weight: np.ndarray
-    d_gain: np.ndarray
-
-
-class Chunk(NamedTuple):
-    """Room for one chunk. gradient, gain_gradient: of the decoder and of the exposures, summed over the chunk."""
-
-    rays: RayBatch
-    samples: Samples
-    work: Work
-    gradient: Decoder
-    gain_gradient: np.ndarray
+    start: int
+    num_rays: int
+    depth_start: int
+    num_depth_rays: int
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
-def random_share(seed, number):
+def random_uniform(seed, number):
     """A number in [0, 1) that depends on seed and number alone.
 
     Source:
@@ -120,59 +113,41 @@ def draw_rays(table, space, gains, start, count, seed, background, rays, at):
             color = np.float32(table.rgba[row, c]) * scale
             rays.target[n * 3 + c] = color * alpha + background[c] * (np.float32(1) - alpha)
         rays.image[n] = v
-        rays.point[n] = row
-        rays.free[n] = table.free[row]
-        rays.jitter[n] = random_share(seed, start + k)
+        rays.depth_row[n] = row
+        rays.free_distance[n] = table.free_distance[row]
+        rays.jitter[n] = random_uniform(seed, start + k)
         marched_ray_numba(space, rays.origins, rays.directions, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def chunk_step(
-    table,
-    start,
-    count,
-    known,
-    points,
-    first_known,
-    num_known,
-    gains,
-    seed,
-    background,
-    grid,
-    box,
-    march,
-    far,
-    terms,
-    decoder,
-    transposed,
-    width,
-    chunk,
-):
+def chunk_step(model, sources, draw, terms, far, chunk):
     """Gradients of one chunk: of the decoder in chunk.gradient, of the interpolated values in samples.features.
 
-    The first `num_known` rays are those of the table `known`, from number `first_known` on, with `points` on them.
-    Returns (rays, samples, steps asked, sum of squared colour errors).
+    Rays to triangulated points come first, then those of the table.
+    Returns (rays, samples, density evaluations, sum of squared colour errors).
     """
-    rays, samples, work = chunk.rays, chunk.samples, chunk.work
-    used = 4 * grid.per_unit.shape[0]
-    draw_rays(known, box.space, gains, first_known, num_known, seed + 1, background, rays, 0)
-    draw_rays(table, box.space, gains, start, count, seed, background, rays, num_known)
-    rays.point[num_known : num_known + count] = -1
-    num_rays, n, asked = march_rays(
-        grid, box, march, rays.origins, rays.directions, rays.jitter, far, num_known + count, width, samples,
-        rays.first, rays.passed,
-    )  # fmt: skip
+    rays, samples, work, decoder = chunk.rays, chunk.samples, chunk.work, model.decoder
+    width, used = model.width, 4 * model.grid.per_unit.shape[0]
+    draw_chunk(sources, model.box.space, draw, rays)
+    num_rays, n, evaluations = march_rays(
+        model.grid,
+        model.box,
+        model.march,
+        rays.origins,
+        rays.directions,
+        rays.jitter,
+        far,
+        draw.num_depth_rays + draw.num_rays,
+        width,
+        samples,
+        rays.first,
+        rays.end_transmittance,
+    )
     decode_directions(decoder, rays.views, num_rays, work.per_ray)
     decode_numba(decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
-    point_terms(
-        samples, num_rays, rays.first, rays.point, rays.free, points, march.step, terms.points, terms.free,
-        work.d_weight,
-    )  # fmt: skip
-    loss = composite_backward(
-        samples, num_rays, rays.first, rays.passed, rays.target, rays.background, rays.gain, work.rgb, work.d_weight,
-        GRADIENT_SCALE, terms.sparsity, terms.emptiness, work.d_color, work.d_raw, work.d_gain,
-    )  # fmt: skip
+    ray_terms(samples, rays, num_rays, sources.sparse_depths, model.march.step, terms, work.d_weight)
+    loss = composite_backward(samples, rays, work, num_rays, terms, GRADIENT_SCALE)
     chunk.gain_gradient[:] = 0
     for ray in range(num_rays):
         for c in range(3):
@@ -183,7 +158,29 @@ def chunk_step(
     chunk.gradient.color_weights[:] = 0
     chunk.gradient.color_bias[:] = 0
     decode_backward(
-        decoder, transposed, n, num_rays, samples.features, width, used, samples.ray, rays.views, work.hidden,
-        work.d_color, work.d_raw, work.d_per_ray, chunk.gradient,
-    )  # fmt: skip
-    return num_rays, n, asked, loss
+        decoder,
+        model.transposed,
+        n,
+        num_rays,
+        samples.features,
+        width,
+        used,
+        samples.ray,
+        rays.views,
+        work.hidden,
+        work.d_color,
+        work.d_log_density,
+        work.d_per_ray,
+        chunk.gradient,
+    )
+    return num_rays, n, evaluations, loss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def draw_chunk(sources, space, draw, rays):
+    """The rays of one chunk: those to triangulated points, then those of the table."""
+    gains, seed, background, first = sources.gains, sources.seed, sources.background, draw.num_depth_rays
+    draw_rays(sources.depth_rays, space, gains, draw.depth_start, first, seed + 1, background, rays, 0)
+    draw_rays(sources.table, space, gains, draw.start, draw.num_rays, seed, background, rays, first)
+    rays.depth_row[first : first + draw.num_rays] = -1

@@ -1,7 +1,7 @@
-"""The fast field in torch: the same parameters, with gradients by autograd.
+"""The grid field in torch: the same parameters, with gradients by autograd.
 
-`TorchFastField` is the oracle for the hand-written gradients; what follows the interpolation also trains the field on
-other devices than the CPU, see `torch_fast_training`. Samples are packed: sample i belongs to ray `ray[i]`, and the
+`TorchGridField` is the oracle for the hand-written gradients; what follows the interpolation also trains the field on
+other devices than the CPU, see `grid_torch.training`. Samples are packed: sample i belongs to ray `ray[i]`, and the
 samples of a ray lie in order.
 """
 
@@ -14,24 +14,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fieldstone.field.grid.decoder import DIRECTIONS, HIDDEN, Decoder
-from fieldstone.field.grid.field import FastField
+from fieldstone.field.grid.field import GridField
 from fieldstone.field.grid.layout import CHANNELS
-from fieldstone.field.grid.march_numba import MAX_RAW
+from fieldstone.field.grid.march_numba import MAX_LOG_DENSITY
 
 
 @dataclass(frozen=True, eq=False)
-class TorchFastField:
-    """Parameters of a fast field as leaf tensors, and what does not learn."""
+class TorchGridField:
+    """Parameters of a grid field as leaf tensors, and what does not learn."""
 
     levels: tuple[Tensor, ...]
     """(x, y, z, 4) each."""
     spacings: tuple[float, ...]
     decoder: dict[str, Tensor]
     """By the names of `Decoder`."""
-    raw_offset: float
+    density_bias: float
 
 
-def torch_fast_field(field: FastField, dtype: torch.dtype, device: torch.device) -> TorchFastField:
+def torch_grid_field(field: GridField, dtype: torch.dtype, device: torch.device) -> TorchGridField:
     """The parameters of a field, copied; gradients are required."""
 
     def leaf(array: object) -> Tensor:
@@ -39,11 +39,11 @@ def torch_fast_field(field: FastField, dtype: torch.dtype, device: torch.device)
 
     levels = tuple(leaf(field.layout.level(field.table, n)) for n in range(field.layout.num_levels))
     decoder = {name: leaf(getattr(field.decoder, name)) for name in Decoder._fields}
-    return TorchFastField(levels, tuple(field.layout.spacings.tolist()), decoder, field.raw_offset)
+    return TorchGridField(levels, tuple(field.layout.spacings.tolist()), decoder, field.density_bias)
 
 
-def interpolate(field: TorchFastField, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n l c"]:
-    """As `fast_grid.interpolate`."""
+def interpolate(field: TorchGridField, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n l c"]:
+    """As `layout.interpolate`."""
     out = []
     for vertices, spacing in zip(field.levels, field.spacings, strict=True):
         x = points / spacing
@@ -61,7 +61,7 @@ def interpolate(field: TorchFastField, points: Float[Tensor, "n 3"]) -> Float[Te
 def decode(
     decoder: dict[str, Tensor], values: Float[Tensor, "n l c"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """As `fast_decoder.decode`."""
+    """As `decoder.decode`."""
     x, y, z = directions.unbind(dim=1)
     basis = torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0], dim=1)
     weights = decoder["feature_weights"].reshape(-1, CHANNELS, HIDDEN)[: values.shape[1], 1:]
@@ -70,17 +70,18 @@ def decode(
     return torch.sigmoid(hidden.relu() @ decoder["color_weights"].reshape(3, HIDDEN).T + decoder["color_bias"])
 
 
-def optical_depths_of(values: Float[Tensor, "n l c"], raw_offset: float, depth_scale: float) -> Float[Tensor, "n"]:
+def optical_depths_of(values: Float[Tensor, "n l c"], density_bias: float, depth_scale: float) -> Float[Tensor, "n"]:
     """Optical depth of each sample from its interpolated values.
 
-    Above `MAX_RAW` a sample is as dense as it gets; its gradient is that of what it has, not 0: it can get thinner.
+    Above `MAX_LOG_DENSITY` a sample is as dense as it gets; its gradient is that of what it has, not 0: it can get
+    thinner.
 
     Args:
         depth_scale: Optical depth of a sample at density 1.
     """
-    raw = values[:, :, 0].sum(dim=1) + raw_offset
-    raw = raw - (raw - float(MAX_RAW)).clamp(min=0.0).detach()
-    return torch.exp(raw) * depth_scale
+    log_density = values[:, :, 0].sum(dim=1) + density_bias
+    log_density = log_density - (log_density - float(MAX_LOG_DENSITY)).clamp(min=0.0).detach()
+    return torch.exp(log_density) * depth_scale
 
 
 def depths_before(
@@ -104,15 +105,15 @@ def composite_packed(
     rgb: Float[Tensor, "n 3"],
     weights: Float[Tensor, "n"],
     ray: Int[Tensor, "n"],
-    passed: Float[Tensor, "r"],
+    end_transmittance: Float[Tensor, "r"],
     background: Float[Tensor, "r 3"],
 ) -> Float[Tensor, "r 3"]:
     """Colours of rays from those of their samples, and of the background where light passes."""
-    return (passed[:, None] * background).index_add(0, ray, weights[:, None] * rgb)
+    return (end_transmittance[:, None] * background).index_add(0, ray, weights[:, None] * rgb)
 
 
 def packed_colors(
-    field: TorchFastField,
+    field: TorchGridField,
     points: Float[Tensor, "n 3"],
     ray: Int[Tensor, "n"],
     directions: Float[Tensor, "r 3"],
@@ -125,20 +126,20 @@ def packed_colors(
         depth_scale: Optical depth of a sample at density 1.
     """
     values = interpolate(field, points)
-    tau = optical_depths_of(values, field.raw_offset, depth_scale)
+    tau = optical_depths_of(values, field.density_bias, depth_scale)
     before, total = depths_before(tau, ray, len(directions))
     weights = torch.exp(-before) * -torch.expm1(-tau)
     rgb = decode(field.decoder, values, directions[ray])
     return composite_packed(rgb, weights, ray, torch.exp(-total), background)
 
 
-def optical_depths(field: TorchFastField, points: Float[Tensor, "n 3"], depth_scale: float) -> Float[Tensor, "n"]:
+def optical_depths(field: TorchGridField, points: Float[Tensor, "n 3"], depth_scale: float) -> Float[Tensor, "n"]:
     """Optical depth of each sample; arguments as of `packed_colors`."""
-    return optical_depths_of(interpolate(field, points), field.raw_offset, depth_scale)
+    return optical_depths_of(interpolate(field, points), field.density_bias, depth_scale)
 
 
 def packed_weights(
-    field: TorchFastField, points: Float[Tensor, "n 3"], ray: Int[Tensor, "n"], num_rays: int, depth_scale: float
+    field: TorchGridField, points: Float[Tensor, "n 3"], ray: Int[Tensor, "n"], num_rays: int, depth_scale: float
 ) -> Float[Tensor, "n"]:
     """Share of the light of its ray that ends in each packed sample; arguments as of `packed_colors`."""
     tau = optical_depths(field, points, depth_scale)

@@ -1,4 +1,4 @@
-"""The feature grids of the fast field on a torch device: interpolated from, and moved, only where samples lie.
+"""The feature grids of the grid field on a torch device: interpolated from, and moved, only where samples lie.
 
 All levels are rows of one table. A batch takes the rows that it touches out of the table; they alone are leaves of
 autograd and are put back after their step, so that a step costs what its samples cost, not what the grid holds.
@@ -18,10 +18,10 @@ from fieldstone.field.grid.layout import CHANNELS, GridLayout
 
 @dataclass(frozen=True, eq=False)
 class TorchGrid:
-    """Vertices of all levels, one row each, in the order of `FastField.table`; updated in place by `move_rows`."""
+    """Vertices of all levels, one row each, in the order of `GridField.table`; updated in place by `step_rows`."""
 
     vertices: Float[Tensor, "m c"]
-    velocity: Float[Tensor, "m c"]
+    mean_square: Float[Tensor, "m c"]
     """Mean squared gradient of each value."""
     first: Int[Tensor, "l"]
     """Row of the first vertex of each level."""
@@ -31,7 +31,7 @@ class TorchGrid:
 
 
 def torch_grid(
-    layout: GridLayout, table: Float[np.ndarray, "t"], velocity: Float[np.ndarray, "t"], device: torch.device
+    layout: GridLayout, table: Float[np.ndarray, "t"], mean_square: Float[np.ndarray, "t"], device: torch.device
 ) -> TorchGrid:
     """A grid and its mean squared gradients, copied to a device."""
 
@@ -40,7 +40,7 @@ def torch_grid(
 
     return TorchGrid(
         copied(table.reshape(-1, CHANNELS)),
-        copied(velocity.reshape(-1, CHANNELS)),
+        copied(mean_square.reshape(-1, CHANNELS)),
         copied(layout.offsets[:-1] // CHANNELS),
         copied(layout.sizes),
         copied((1.0 / layout.spacings).astype(np.float32)),
@@ -66,30 +66,30 @@ def corners_of(grid: TorchGrid, points: Float[Tensor, "n 3"]) -> tuple[Int[Tenso
 def weighted_rows(
     vertices: Float[Tensor, "k c"], rows: Int[Tensor, "n l 8"], weights: Float[Tensor, "n l 8"]
 ) -> Float[Tensor, "n l c"]:
-    """As `fast_grid.interpolate`, with what `corners_of` found."""
+    """As `layout.interpolate`, with what `corners_of` found."""
     values = vertices.index_select(0, rows.reshape(-1)).reshape(*rows.shape, vertices.shape[1])
     return (weights[..., None] * values).sum(dim=2)
 
 
-def move_rows(
+def step_rows(
     grid: TorchGrid,
     rows: Int[Tensor, "k"],
     gradient: Float[Tensor, "k c"],
     rates: Float[Tensor, "c"],
-    kept: Float[Tensor, "l c"],
+    decay_factors: Float[Tensor, "l c"],
     decay: float,
     epsilon: float,
 ) -> None:
-    """One step of `fast_grid_numba.step_touched`, in place.
+    """One step of `interpolation_numba.step_touched`, in place.
 
     Args:
         rows: Each once.
         kept: What each level keeps of itself, by channel.
     """
-    vertices, velocity = grid.vertices[rows], grid.velocity[rows]
-    v = decay * velocity + (1.0 - decay) * gradient**2
+    vertices, mean_square = grid.vertices[rows], grid.mean_square[rows]
+    v = decay * mean_square + (1.0 - decay) * gradient**2
     level = torch.searchsorted(grid.first, rows, right=True) - 1
-    moved = kept[level] * vertices - rates * gradient / (torch.sqrt(v) + epsilon)
+    stepped = decay_factors[level] * vertices - rates * gradient / (torch.sqrt(v) + epsilon)
     touched = gradient != 0
-    grid.velocity[rows] = torch.where(touched, v, velocity)
-    grid.vertices[rows] = torch.where(touched, moved, vertices)
+    grid.mean_square[rows] = torch.where(touched, v, mean_square)
+    grid.vertices[rows] = torch.where(touched, stepped, vertices)

@@ -1,4 +1,4 @@
-"""Rays through a fast field on a torch device: the samples of `fast_march_numba.march_rays`, all rays at once."""
+"""Rays through a grid field on a torch device: the samples of `march_numba.march_rays`, all rays at once."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 
 from fieldstone.field.base.space import Space
 from fieldstone.field.grid.field import FOREVER
-from fieldstone.field.grid.march_numba import MIN_RAW, March
+from fieldstone.field.grid.march_numba import MIN_LOG_DENSITY, March
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.field.grid_torch.field import depths_before, optical_depths_of
 from fieldstone.field.grid_torch.layout import TorchGrid, corners_of, weighted_rows
 
-PLACES_AT_ONCE = 1 << 22
+POSITIONS_AT_ONCE = 1 << 22
 """Places on rays that are looked at together: about 300 MB."""
 
 LOOK_EVERY = 32
@@ -26,7 +26,7 @@ LOOK_EVERY = 32
 
 @dataclass(frozen=True, eq=False)
 class TorchBox:
-    """Where there is something, as `fast_march_numba.Box`, without the distances."""
+    """Where there is something, as `march_numba.Box`, without the distances."""
 
     lower: Float[Tensor, "3"]
     extent: Float[Tensor, "3"]
@@ -44,14 +44,14 @@ class PackedSamples:
     """In the grid, relative to the lower corner of the box."""
     distance: Float[Tensor, "n"]
     ray: Int[Tensor, "n"]
-    veil: Float[Tensor, "n"]
+    skipped_tau: Float[Tensor, "n"]
     """Optical depth in front of each sample that was left out because it hardly weighs."""
-    veil_behind: Float[Tensor, "r"]
+    skipped_tau_of_ray: Float[Tensor, "r"]
     """The same for whole rays."""
 
 
 def torch_box(occupancy: Occupancy, extent: Float[np.ndarray, "3"], space: Space, device: torch.device) -> TorchBox:
-    """As `fast_field.occupancy_box`, on a device."""
+    """As `field.occupancy_box`, on a device."""
     lower, size = (torch.tensor(a.astype(np.float32), device=device) for a in (occupancy.lower, extent))
     cells = torch.tensor(occupancy.cells, device=device)
     return TorchBox(lower, size, cells, float(occupancy.cell_size), space)
@@ -64,32 +64,34 @@ def march_packed(
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     jitter: Float[Tensor, "r"],
-    room: int,
+    capacity: int,
 ) -> PackedSamples:
-    """The samples of as many rays, from the first on, as have less than `room` together (of one ray at least).
+    """The samples of as many rays, from the first on, as have less than `capacity` together (of one ray at least).
 
     Args:
         jitter: Share of a step before the first sample.
     """
     with torch.no_grad():
-        points, distance, ray = _places(box, march, origins, directions, jitter)
+        points, distance, ray = _occupied_positions(box, march, origins, directions, jitter)
         values = weighted_rows(grid.vertices, *corners_of(grid, points))
-        tau = optical_depths_of(values, float(march.raw_offset), float(march.depth_scale))
-        empty = values[:, :, 0].sum(dim=1) + float(march.raw_offset) <= float(MIN_RAW)
+        tau = optical_depths_of(values, float(march.density_bias), float(march.depth_scale))
+        empty = values[:, :, 0].sum(dim=1) + float(march.density_bias) <= float(MIN_LOG_DENSITY)
         tau = torch.where(empty, 0.0, tau)
-        light = torch.exp(-depths_before(tau, ray, len(origins))[0])
-        reached = light >= float(march.min_light)
-        kept = reached & (light * -torch.expm1(-tau) > float(march.min_weight))
+        transmittance = torch.exp(-depths_before(tau, ray, len(origins))[0])
+        reached = transmittance >= float(march.early_stop_eps)
+        kept = reached & (transmittance * -torch.expm1(-tau) > float(march.min_weight))
         counts = torch.zeros(len(origins), dtype=ray.dtype, device=ray.device).index_add(0, ray, kept.to(ray.dtype))
-        num_rays = max(int(torch.count_nonzero(torch.cumsum(counts, dim=0) < room)), 1)
+        num_rays = max(int(torch.count_nonzero(torch.cumsum(counts, dim=0) < capacity)), 1)
         within = ray < num_rays
         thin = torch.where(reached & ~kept, tau, 0.0)[within]
-        veil, veil_behind = depths_before(thin, ray[within], num_rays)
+        skipped_tau, skipped_tau_of_ray = depths_before(thin, ray[within], num_rays)
         kept, of_kept = kept & within, kept[within]
-        return PackedSamples(num_rays, points[kept], distance[kept], ray[kept], veil[of_kept], veil_behind)
+        return PackedSamples(
+            num_rays, points[kept], distance[kept], ray[kept], skipped_tau[of_kept], skipped_tau_of_ray
+        )
 
 
-def _places(
+def _occupied_positions(
     box: TorchBox,
     march: March,
     origins: Float[Tensor, "r 3"],
@@ -101,7 +103,7 @@ def _places(
     distances_of = _contracted_distances if box.space.is_contracted else _bounded_distances
     t, end = distances_of(box, march, origins, directions, jitter)
     parts = []
-    at_once = max(PLACES_AT_ONCE // t.shape[1], 1)
+    at_once = max(POSITIONS_AT_ONCE // t.shape[1], 1)
     for first in range(0, len(origins), at_once):
         rows = slice(first, first + at_once)
         points = origins[rows, None] + t[rows, :, None] * directions[rows, None]

@@ -1,4 +1,4 @@
-"""What a step of the fast field moves once its gradients are known: grids and decoder.
+"""What a step moves once its gradients are known: grids, decoder and exposures.
 
 Pieces of the table are fixed, so that any number of threads gives the same bytes.
 """
@@ -12,112 +12,95 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from fieldstone.field.base.adam import adam_estimates
 from fieldstone.field.grid.decoder import Decoder
-from fieldstone.field.grid.field import FastField
 from fieldstone.field.grid.interpolation_numba import BLOCK, add_gradient, step_by_sample, step_touched
 from fieldstone.field.grid.layout import CHANNELS
-from fieldstone.field.grid_training.buffers import Workspace
-from fieldstone.field.grid_training.plan import FastPlan
+from fieldstone.field.grid_training.plan import LearningRates
+from fieldstone.field.grid_training.state import GridState
 
 EPSILON = np.float32(1e-8)
-DECODER_MEMORY = (0.9, 0.99)
+DECODER_BETAS = (0.9, 0.99)
 
 WORD = 8 * BLOCK
 """Pieces of the table begin at multiples of so many values, and so do levels."""
 
-SPLITS = 8
-"""Pieces that a level is split into by `step_touched`, if it has at least `SPLIT_WORDS`."""
+NUM_PIECES = 8
+"""Pieces that a level is split into by `step_touched`, if it has at least `MIN_SPLIT_WORDS`."""
 
-SPLIT_WORDS = 64
+MIN_SPLIT_WORDS = 64
 
 DECAY_BY_LEVEL = 1.5
-"""A level gives up so many times as much of itself as the next coarser one."""
+"""The weight decay of a level is so many times that of the next coarser one."""
 
 
-def rates_of(plan: FastPlan, share: float) -> Float[np.ndarray, "4"]:
-    """Step by channel, with this share of the first learning rates."""
-    return np.array([plan.density_rate, *[plan.feature_rate] * (CHANNELS - 1)], dtype=np.float32) * np.float32(share)
+def rates_by_channel(rates: LearningRates, multiplier: float) -> Float[np.ndarray, "4"]:
+    """Step of each channel of a vertex, with the learning rates multiplied."""
+    first = np.array([rates.density_rate, *[rates.feature_rate] * (CHANNELS - 1)], dtype=np.float32)
+    return first * np.float32(multiplier)
 
 
-def kept_of(plan: FastPlan, share: float, num_levels: int) -> Float[np.ndarray, "l 4"]:
-    """What a step leaves of the values of a vertex of each level, coarse to fine, by channel."""
-    kept = np.ones((num_levels, CHANNELS), dtype=np.float32)
+def decay_factors(rates: LearningRates, multiplier: float, num_levels: int) -> Float[np.ndarray, "l 4"]:
+    """What weight decay leaves of the values of a vertex of each level, coarse to fine, by channel."""
+    factors = np.ones((num_levels, CHANNELS), dtype=np.float32)
     finer = np.arange(1, num_levels)
-    kept[1:, 0] -= plan.density_rate * share * plan.fine_decay * DECAY_BY_LEVEL ** (finer - float(num_levels - 1))
-    return kept
+    by_level = DECAY_BY_LEVEL ** (finer - float(num_levels - 1))
+    factors[1:, 0] -= rates.density_rate * multiplier * rates.weight_decay * by_level
+    return factors
 
 
-def move_grid(
-    field: FastField,
-    velocity: Float[np.ndarray, "t"],
-    plan: FastPlan,
-    room: Workspace,
-    counts: Int[np.ndarray, "c"],
-    share: float,
-    executor: Executor,
-) -> None:
+def step_grid(state: GridState, counts: Int[np.ndarray, "c"], multiplier: float, executor: Executor) -> None:
     """Move the vertices that a batch has touched, level by level and piece by piece.
 
     Args:
-        velocity: Mean squared gradient of each value, updated too.
-        counts: Samples of each chunk.
-        share: Of the first learning rates.
+        counts: Samples of each chunk; their gradients lie in the buffers of the state.
+        multiplier: Of the learning rates.
     """
-    levels = field.layout.num_levels
-    rates, kept = np.tile(rates_of(plan, share), 2), np.tile(kept_of(plan, share, levels), 2)
-    decay = np.float32(plan.decay)
-    first_immediate = max(levels - plan.immediate_levels, 0)
+    buffers, rates, layout = state.buffers, state.plan.rates, state.field.layout
+    levels, capacity = layout.num_levels, state.plan.sampling.samples_per_chunk
+    # Kernels step two vertices at a time.
+    by_channel = np.tile(rates_by_channel(rates, multiplier), 2)
+    factors = np.tile(decay_factors(rates, multiplier, levels), 2)
+    decay = np.float32(rates.mean_square_decay)
+    first_immediate = max(levels - rates.immediate_levels, 0)
 
-    def add(piece: tuple[int, int]) -> None:
+    def add_or_step(piece: tuple[int, int]) -> None:
         level, half = piece
-        arguments = (
-            room.grid, level, half, counts, plan.samples_per_chunk, room.samples.position, room.samples.features,
-            field.width,
-        )  # fmt: skip
+        samples = (counts, capacity, buffers.samples.position, buffers.samples.features, state.field.width)
         if level < first_immediate:
-            add_gradient(*arguments, room.gradient, room.touched)
+            add_gradient(buffers.grid, level, half, *samples, buffers.gradient, buffers.touched)
         else:
-            step_by_sample(*arguments, velocity, rates, kept[level], decay, EPSILON)
+            moments = (state.mean_square, by_channel, factors[level], decay, EPSILON)
+            step_by_sample(buffers.grid, level, half, *samples, *moments)
 
-    list(executor.map(add, [(level, half) for level in reversed(range(levels)) for half in (0, 1)]))
-
-    def move(piece: tuple[int, int, int]) -> None:
+    def step(piece: tuple[int, int, int]) -> None:
         level, first, last = piece
-        step_touched(
-            field.table, velocity, room.gradient, room.touched, 8 * first, 8 * last, rates, kept[level], decay, EPSILON
-        )
+        gradient = (state.mean_square, buffers.gradient, buffers.touched)
+        step_touched(state.field.table, *gradient, 8 * first, 8 * last, by_channel, factors[level], decay, EPSILON)
 
-    words = field.layout.offsets // WORD
-    list(executor.map(move, [piece for level in range(first_immediate) for piece in _pieces(level, words)]))
+    list(executor.map(add_or_step, [(level, half) for level in reversed(range(levels)) for half in (0, 1)]))
+    words = layout.offsets // WORD
+    list(executor.map(step, [piece for level in range(first_immediate) for piece in _pieces(level, words)]))
 
 
 def _pieces(level: int, words: Int[np.ndarray, "l_plus_1"]) -> list[tuple[int, int, int]]:
     """A level in ranges of words: (level, first, last)."""
     start, end = words[level : level + 2].tolist()
-    parts = SPLITS if end - start >= SPLIT_WORDS else 1
+    parts = NUM_PIECES if end - start >= MIN_SPLIT_WORDS else 1
     bounds = [start + (end - start) * k // parts for k in range(parts + 1)]
     return [(level, first, last) for first, last in pairwise(bounds)]
 
 
-def step_decoder(
-    decoder: Decoder, mean: Decoder, square: Decoder, gradients: Sequence[Decoder], count: int, rate: np.float32
-) -> None:
-    """One Adam step with the gradients of all chunks, added in their order; all in place.
-
-    Args:
-        mean, square: Running means of the gradient and its square.
-        count: Number of this step, from 1.
-
-    Source:
-        `kingma2015`, algorithm 1.
-    """
-    memory, square_memory = (np.float32(m) for m in DECODER_MEMORY)
-    first, second = (np.float32(1.0 - m**count) for m in DECODER_MEMORY)
+def step_decoder(state: GridState, gradients: Sequence[Decoder], multiplier: float) -> None:
+    """One step of Adam with the gradients of all chunks, added in their order."""
+    rate = np.float32(state.plan.rates.decoder_rate * multiplier)
     for name in Decoder._fields:
-        gradient = np.zeros_like(getattr(decoder, name))
+        weights = getattr(state.field.decoder, name)
+        gradient = np.zeros_like(weights)
         for part in gradients:
             gradient += getattr(part, name)
-        m, v = getattr(mean, name), getattr(square, name)
-        m[:] = memory * m + (1 - memory) * gradient
-        v[:] = square_memory * v + (1 - square_memory) * gradient * gradient
-        getattr(decoder, name)[:] -= rate * (m / first) / (np.sqrt(v / second) + EPSILON)
+        moments = (getattr(state.decoder_first_moment, name), getattr(state.decoder_second_moment, name))
+        numerator, denominator = adam_estimates(
+            *moments, gradient, state.step + 1, betas=DECODER_BETAS, epsilon=float(EPSILON)
+        )
+        weights[:] -= rate * numerator / denominator

@@ -41,7 +41,7 @@ density is zero or every colour saturated, gradients vanish, and it never recove
 this often, from other random weights."""
 
 STREAM_WEIGHTS, STREAM_ORDER, STREAM_STEP = 0, 1, 2
-"""What the streams of random numbers are for; see `TorchTraining.step`."""
+"""What the streams of random numbers are for; see `TorchTraining.advance`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class TorchTraining:
         """Random weights, moments zero."""
         return self._attempt(0, 0)
 
-    def step(self, state: TorchState, /) -> tuple[TorchState, StepReport]:
+    def advance(self, state: TorchState, /) -> tuple[TorchState, StepReport]:
         """One step of Adam on one batch; a collapsed field is started again.
 
         Random numbers: the order of the photos follows from (seed, epoch), the batch and the jitter of the samples

@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from fast_scenes import CAMERA, FRAME, RADIUS, ball_images
 from fieldstone.field.base.projection import project_rays, projection_for, unproject_points
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
 from fieldstone.field.base.space import box_space, projective_space
-from fieldstone.field.evidence.sparse_depth import known_rays, seen_points
+from fieldstone.field.evidence.sparse_depth import seen_points, sparse_depth_rays
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
+from grid_scenes import CAMERA, FRAME, RADIUS, ball_images
 
 NOISE_PX = 0.8
 
@@ -76,7 +76,7 @@ def points_on_ball(rng, images, count=40):
 def test_rays_to_points_meet_them_and_show_their_colour():
     images = ball_images(5)
     seen = points_on_ball(np.random.default_rng(1), images)
-    table, on_rays = known_rays(images, FRAME, seen, box_space())
+    table, on_rays = sparse_depth_rays(images, FRAME, seen, box_space())
     assert 0.8 * 200 < len(table.image) <= 200, "some lie where the photo is nearly transparent"
     directions = np.einsum("nij,nj->ni", table.rotations[table.image], table.bearings[table.bearing])
     reached = table.centers[table.image] + on_rays.distance[:, None] * directions
@@ -94,7 +94,7 @@ def test_points_outside_of_masks_are_left_out():
     seen = points_on_ball(np.random.default_rng(1), images)
     keep = np.zeros((CAMERA.height, CAMERA.width), dtype=bool)
     masked = [PosedImage(i.name, i.camera, i.cam_from_world, i.pixels, keep) for i in images[:1]]
-    table, _ = known_rays([*masked, images[1]], FRAME, seen, box_space())
+    table, _ = sparse_depth_rays([*masked, images[1]], FRAME, seen, box_space())
     assert set(table.image.tolist()) == {1}
 
 
@@ -109,7 +109,7 @@ def test_distances_in_a_projective_space_are_those_of_the_marched_rays():
     assert found is not None
     projection, _ = found
     seen = {image.name: SeenPoints(xyz, np.full(50, 0.05)) for image in images}
-    table, on_rays = known_rays(images, FRAME, seen, projective_space(projection))
+    table, on_rays = sparse_depth_rays(images, FRAME, seen, projective_space(projection))
     d = np.einsum("nij,nj->ni", table.rotations[table.image], table.bearings[table.bearing]).astype(np.float64)
     o = table.centers[table.image].astype(np.float64)
     start, direction, _ = project_rays(projection, o, d)

@@ -72,14 +72,14 @@ def gradient_by_basis(layout, points, gradient):
 def test_gradient_is_the_transpose_of_interpolation(chunks):
     rng, layout, table, points = scene()
     gradient = rng.normal(size=(len(points), layout.num_levels, CHANNELS)).astype(np.float32)
-    room = len(points) // chunks
-    grid, counts, positions = layout.arrays(table), np.full(chunks, room), points.reshape(-1)
+    capacity = len(points) // chunks
+    grid, counts, positions = layout.arrays(table), np.full(chunks, capacity), points.reshape(-1)
     out = np.zeros(layout.num_values, dtype=np.float32)
     touched = np.zeros(-(-layout.num_values // (8 * BLOCK)) * 8, dtype=np.uint8)
     for level in range(layout.num_levels):
         for half in (0, 1):
             width = 4 * layout.num_levels
-            add_gradient(grid, level, half, counts, room, positions, gradient.reshape(-1), width, out, touched)
+            add_gradient(grid, level, half, counts, capacity, positions, gradient.reshape(-1), width, out, touched)
     expected = gradient_by_basis(layout, points.astype(np.float64), gradient)
     np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-5)
     blocks = np.flatnonzero(out) // BLOCK
@@ -89,19 +89,21 @@ def test_gradient_is_the_transpose_of_interpolation(chunks):
 def test_step_moves_only_what_has_a_gradient():
     rng = np.random.default_rng(1)
     size = 8 * BLOCK * 4
-    table, velocity = rng.normal(size=(2, size)).astype(np.float32)
-    velocity = np.abs(velocity)
+    table, mean_square = rng.normal(size=(2, size)).astype(np.float32)
+    mean_square = np.abs(mean_square)
     gradient = np.where(rng.random(size) < 0.1, rng.normal(size=size), 0).astype(np.float32)
     touched = np.zeros(size // BLOCK, dtype=np.uint8)
     touched[np.flatnonzero(gradient) // BLOCK] = 1
     rates = np.array([0.3, 0.1, 0.1, 0.1] * 2, dtype=np.float32)
-    kept = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
-    v = np.where(gradient != 0, 0.9 * velocity + 0.1 * gradient**2, velocity)
+    decay_factors = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
+    v = np.where(gradient != 0, 0.9 * mean_square + 0.1 * gradient**2, mean_square)
     step = np.tile(rates, size // 8) * gradient / (np.sqrt(v) + 1e-8)
-    p = np.where(gradient != 0, np.tile(kept, size // 8) * table - step, table)
-    step_touched(table, velocity, gradient, touched, 0, len(touched), rates, kept, np.float32(0.9), np.float32(1e-8))
+    p = np.where(gradient != 0, np.tile(decay_factors, size // 8) * table - step, table)
+    step_touched(
+        table, mean_square, gradient, touched, 0, len(touched), rates, decay_factors, np.float32(0.9), np.float32(1e-8)
+    )
     np.testing.assert_allclose(table, p, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(velocity, v, rtol=1e-5)
+    np.testing.assert_allclose(mean_square, v, rtol=1e-5)
     assert not gradient.any()
     assert not touched.any()
 
@@ -110,10 +112,10 @@ def test_stepping_by_sample_is_stepping_one_sample_after_the_other():
     rng, layout, table, points = scene(n=40)
     level = layout.num_levels - 1
     gradient = rng.normal(size=(len(points), layout.num_levels, CHANNELS)).astype(np.float32)
-    velocity = np.abs(rng.normal(size=table.shape)).astype(np.float32)
+    mean_square = np.abs(rng.normal(size=table.shape)).astype(np.float32)
     rates = np.array([0.3, 0.1, 0.1, 0.1] * 2, dtype=np.float32)
-    kept = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
-    p, v = table.astype(np.float64), velocity.astype(np.float64)
+    decay_factors = np.array([0.9, 1.0, 1.0, 1.0] * 2, dtype=np.float32)
+    p, v = table.astype(np.float64), mean_square.astype(np.float64)
     for n in range(len(points)):
         only_last = np.where(np.arange(layout.num_levels)[None, :, None] == level, gradient[n : n + 1], 0)
         g = gradient_by_basis(layout, points[n : n + 1].astype(np.float64), only_last)
@@ -122,13 +124,24 @@ def test_stepping_by_sample_is_stepping_one_sample_after_the_other():
         layout.level(reached, level)[i : i + 2, j : j + 2, k : k + 2] = 1.0  # also those with weight 0
         seen = reached > 0
         v[seen] = 0.9 * v[seen] + 0.1 * g[seen] ** 2
-        rate, keep = (np.tile(values, len(p) // 8) for values in (rates, kept))
+        rate, keep = (np.tile(values, len(p) // 8) for values in (rates, decay_factors))
         p[seen] = keep[seen] * p[seen] - rate[seen] * g[seen] / (np.sqrt(v[seen]) + 1e-8)
     for half in (0, 1):
         step_by_sample(
-            layout.arrays(table), level, half, np.array([len(points)]), len(points), points.reshape(-1),
-            gradient.reshape(-1), 4 * layout.num_levels, velocity, rates, kept, np.float32(0.9), np.float32(1e-8),
-        )  # fmt: skip
+            layout.arrays(table),
+            level,
+            half,
+            np.array([len(points)]),
+            len(points),
+            points.reshape(-1),
+            gradient.reshape(-1),
+            4 * layout.num_levels,
+            mean_square,
+            rates,
+            decay_factors,
+            np.float32(0.9),
+            np.float32(1e-8),
+        )
     np.testing.assert_allclose(table, p, rtol=1e-3, atol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Small scenes for the tests of the fast field: a ball photographed from around, and a field with random values."""
+"""Small scenes for the tests of the grid field: a ball photographed from around, and a field with random values."""
 
 import numpy as np
 
@@ -6,9 +6,10 @@ from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.decoder import decoder_width, initial_decoder
-from fieldstone.field.grid.field import FastField
+from fieldstone.field.grid.field import GridField
 from fieldstone.field.grid.layout import grid_layout
 from fieldstone.field.grid.occupancy import full_box
+from fieldstone.field.grid_training.plan import GridPlan, Schedule
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.render.camera_paths import look_at
@@ -41,7 +42,7 @@ def ball_image(name, camera, eye):
     return PosedImage(name, camera, pose, pixels)
 
 
-def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
+def random_field(rng, resolutions=(3, 6, 12), max_levels=4, density_bias=0.0):
     """A field with density everywhere."""
     occupancy = full_box(np.array([-1.0, -0.7, -0.5]), np.array([2.0, 1.5, 1.0]), 8)
     layout = grid_layout(occupancy.extent, resolutions)
@@ -49,7 +50,21 @@ def random_field(rng, resolutions=(3, 6, 12), max_levels=4, raw_offset=0.0):
     decoder = initial_decoder(decoder_width(max_levels), rng)
     for weights in decoder:
         weights += rng.normal(scale=0.1, size=weights.shape).astype(np.float32)
-    return FastField(layout, table, decoder, occupancy, raw_offset, 1.0, 0.0, box_space())
+    return GridField(
+        layout=layout,
+        table=table,
+        decoder=decoder,
+        occupancy=occupancy,
+        density_bias=density_bias,
+        step_cells=1.0,
+        near=0.0,
+        space=box_space(),
+    )
+
+
+def plan_of(finest, steps, **settings) -> GridPlan:
+    """A plan with these settings, by name."""
+    return GridPlan(Schedule(finest=finest, steps=steps)).replaced(**settings)
 
 
 def random_rays(rng, field, count):

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fast_scenes import FRAME, RADIUS, ball_images
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.radiance_field import FieldTraining
@@ -14,22 +13,25 @@ from fieldstone.field.grid.field import compress, expand, field_from_tensors, oc
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.field.grid.occupancy_numba import rays_that_hit
 from fieldstone.field.grid.rays import coprime_stride, pixels_that_hit
-from fieldstone.field.grid_training.plan import FastPlan, corrected, plan_for_budget, plan_from_json
-from fieldstone.field.grid_training.training import FastTraining, fast_training
+from fieldstone.field.grid_training.budget import corrected, plan_for_budget
+from fieldstone.field.grid_training.plan import plan_from_json
+from fieldstone.field.grid_training.prepare import prepare_grid_training
+from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.geometry.camera import Camera, bearings_from_image
 from fieldstone.scene.rays import pixel_centers, rays_from_view
+from grid_scenes import FRAME, RADIUS, ball_images, plan_of
 
-PLAN = FastPlan(finest=32, steps=(5, 5, 5, 5, 4, 3, 2, 1), num_chunks=4, samples_per_chunk=512)
+PLAN = plan_of(finest=32, steps=(5, 5, 5, 5, 4, 3, 2, 1), num_chunks=4, samples_per_chunk=512)
 
 
-def training(executor, plan=PLAN, images=None, **options) -> FastTraining:
-    return fast_training(images or ball_images(), FRAME, plan, seed=0, executor=executor, **options)
+def training(executor, plan=PLAN, images=None, **options) -> GridTraining:
+    return prepare_grid_training(images or ball_images(), FRAME, plan, seed=0, executor=executor, **options)
 
 
 def run(training, state, steps):
-    state, report = training.step(state)
+    state, report = training.advance(state)
     for _ in range(steps - 1):
-        state, report = training.step(state)
+        state, report = training.advance(state)
     return state, report
 
 
@@ -40,14 +42,28 @@ def same_tensors(a, b):
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
+def test_a_state_that_was_given_away_is_refused():
+    """Its arrays are those of a later step: stepping them again would give neither the same state nor a right one."""
+    with ThreadPoolExecutor(1) as executor:
+        work = training(executor)
+        first = work.start()
+        second, _ = work.advance(first)
+        with pytest.raises(ValueError, match="after 0 steps was stepped already"):
+            work.advance(first)
+        third, _ = work.advance(second)
+        assert third.step == 2
+        with pytest.raises(ValueError, match="after 1 steps was stepped already"):
+            work.advance(second)
+
+
 @pytest.mark.parametrize("immediate_levels", [0, 1])
 def test_threads_do_not_change_a_bit(immediate_levels):
     results = []
-    plan = replace(PLAN, immediate_levels=immediate_levels)
+    plan = PLAN.replaced(immediate_levels=immediate_levels)
     for threads in (1, 2, 5):
         with ThreadPoolExecutor(threads) as executor:
             work = training(executor, plan)
-            state, _ = run(work, work.start(), plan.total_steps)
+            state, _ = run(work, work.start(), plan.schedule.total_steps)
             results.append(work.to_tensors(state))
     same_tensors(results[0], results[1])
     same_tensors(results[0], results[2])
@@ -58,17 +74,17 @@ def test_a_stop_does_not_change_a_bit(stop):
     with ThreadPoolExecutor(2) as executor:
         work = training(executor)
         assert isinstance(work, FieldTraining)
-        through, _ = run(work, work.start(), PLAN.total_steps)
+        through, _ = run(work, work.start(), PLAN.schedule.total_steps)
         stopped, _ = run(work, work.start(), stop)
         saved = {name: array.copy() for name, array in work.to_tensors(stopped).items()}
-        resumed, _ = run(work, work.from_tensors(saved), PLAN.total_steps - stop)
+        resumed, _ = run(work, work.from_tensors(saved), PLAN.schedule.total_steps - stop)
         same_tensors(work.to_tensors(through), work.to_tensors(resumed))
 
 
 @pytest.mark.parametrize("stop", [75, 120, 139])
 def test_a_stop_before_cells_change_their_size_does_not_change_a_bit(stop):
     """Cells whose new size does not divide the old one reach vertices that had been given up."""
-    plan = replace(PLAN, finest=101, steps=(70, 60, 40, 20, 8, 8, 8, 8))
+    plan = PLAN.replaced(finest=101, steps=(70, 60, 40, 20, 8, 8, 8, 8))
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, plan, use_alpha=False)
         state, _ = run(work, work.start(), stop)
@@ -83,10 +99,10 @@ def test_a_stop_before_cells_change_their_size_does_not_change_a_bit(stop):
 @pytest.mark.parametrize("use_alpha", [True, False])
 def test_a_ball_is_learned_in_seconds(use_alpha):
     images = ball_images(20)
-    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
+    plan = PLAN.replaced(steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, plan, images[1:], use_alpha=use_alpha)
-        state, report = run(work, work.start(), plan.total_steps)
+        state, report = run(work, work.start(), plan.schedule.total_steps)
         image = images[0]
         rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
     shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
@@ -106,11 +122,13 @@ def test_a_scene_with_points_is_contracted():
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
     dark = replace(FRAME, background=np.zeros(3))
-    plan = replace(PLAN, steps=(20, 20, 20, 20, 20, 10, 5, 5))
+    plan = PLAN.replaced(steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
-        work = fast_training(images[1:], dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False)
+        work = prepare_grid_training(
+            images[1:], dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False
+        )
         assert work.space.is_contracted
-        state, _ = run(work, work.start(), plan.total_steps)
+        state, _ = run(work, work.start(), plan.schedule.total_steps)
         image = images[0]
         rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
     shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
@@ -131,13 +149,13 @@ def test_the_field_survives_saving():
 
 def test_samples_stay_in_the_grid_however_often_cells_change_their_size():
     """Cells that do not divide the box reach beyond it; rays must not follow them out of the grids."""
-    plan = replace(PLAN, finest=37)
+    plan = PLAN.replaced(finest=37)
     with ThreadPoolExecutor(1) as executor:
         work = training(executor, plan, use_alpha=False)
         state = work.start()
-        for _ in range(plan.total_steps):
-            state, _ = work.step(state)
-            layout, positions = state.field.layout, state.workspace.samples.position.reshape(-1, 3)
+        for _ in range(plan.schedule.total_steps):
+            state, _ = work.advance(state)
+            layout, positions = state.field.layout, state.buffers.samples.position.reshape(-1, 3)
             assert np.all(positions <= layout.extent.astype(np.float32))
             last = (positions[:, None] / layout.spacings[None, :, None]).astype(int) + 1
             assert np.all(last < layout.sizes[None])
@@ -173,16 +191,16 @@ def test_photos_that_see_nothing_are_refused():
 @pytest.mark.parametrize(("finest", "min_weight"), [(32, 8e-3), (384, 8e-3), (384, 3e-2)])
 def test_the_fog_of_the_start_is_seen(finest, min_weight):
     """However short the steps of a grid are, its first samples weigh enough to be learned from."""
-    plan = replace(PLAN, finest=finest, min_weight=min_weight)
+    plan = PLAN.replaced(finest=finest, min_weight=min_weight)
     with ThreadPoolExecutor(1) as executor:
         state = training(executor, plan).start()
-    march = state.field.march(plan.min_weight, plan.min_light)
-    assert -np.expm1(-np.exp(march.raw_offset) * march.depth_scale) > 1.15 * min_weight
+    march = state.field.march(plan.sampling.min_weight, plan.sampling.early_stop_eps)
+    assert -np.expm1(-np.exp(march.density_bias) * march.depth_scale) > 1.15 * min_weight
 
 
 def test_scouting_finds_the_box_around_the_ball():
     """Without alpha the box of the start is that of the frame; after one stage it is little more than the ball."""
-    plan = replace(PLAN, finest=64, steps=(120, 3, 1, 1, 1, 1, 1, 1))
+    plan = PLAN.replaced(finest=64, steps=(120, 3, 1, 1, 1, 1, 1, 1))
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, plan, ball_images(20), use_alpha=False)
         state, _ = run(work, work.start(), 121)
@@ -193,7 +211,7 @@ def test_scouting_finds_the_box_around_the_ball():
         assert np.all(upper > RADIUS)
         assert np.all(upper - lower < 2.6)
         assert state.step == 121
-        assert state.field.layout.resolutions == plan.levels(1)
+        assert state.field.layout.resolutions == plan.schedule.levels(1)
         saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
         same_tensors(
             work.to_tensors(run(work, state, 3)[0]), work.to_tensors(run(work, work.from_tensors(saved), 3)[0])
@@ -228,23 +246,31 @@ def test_every_row_is_drawn_once_a_round():
 
 def test_a_plan_survives_json_and_rates_fall():
     assert plan_from_json(PLAN.to_json()) == PLAN
-    shares = [PLAN.rate_share(step) for step in range(PLAN.total_steps)]
+    shares = [PLAN.rate_multiplier(step) for step in range(PLAN.schedule.total_steps)]
     assert shares[0] == 1.0
     assert np.all(np.diff(shares) < 0)
-    assert shares[-1] > PLAN.final_rate
+    assert shares[-1] > PLAN.rates.final_rate_ratio
     with pytest.raises(ValueError, match="plan"):
         plan_from_json('{"finest": 3}')
 
 
 def test_a_plan_of_before_densities_decayed_means_what_it_meant():
-    assert plan_from_json('{"finest": 64, "steps": [1, 1, 1, 1, 1, 1, 1, 1]}').fine_decay == 0.0
+    assert plan_from_json('{"finest": 64, "steps": [1, 1, 1, 1, 1, 1, 1, 1]}').rates.weight_decay == 0.0
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"num_chunks": 0}, {"samples_per_chunk": -1}, {"min_weight": 0.0}, {"finest": 64.5}, {"decay": "x"},
-     {"steps": [10.5] * 8}, {"density_rate": float("nan")}, {"immediate_levels": -1}],
-)  # fmt: skip
+    [
+        {"num_chunks": 0},
+        {"samples_per_chunk": -1},
+        {"min_weight": 0.0},
+        {"finest": 64.5},
+        {"decay": "x"},
+        {"steps": [10.5] * 8},
+        {"density_rate": float("nan")},
+        {"immediate_levels": -1},
+    ],
+)
 def test_settings_that_make_no_sense_are_named(wrong):
     settings = json.loads(PLAN.to_json()) | wrong
     with pytest.raises(ValueError, match=next(iter(wrong)).replace("steps", "step")):
@@ -253,30 +279,32 @@ def test_settings_that_make_no_sense_are_named(wrong):
 
 def test_a_budget_is_shared_out_and_corrected():
     plan = plan_for_budget(PLAN, 10.0, 1.0, 0.01)
-    assert 400 < plan.total_steps < 900
+    assert 400 < plan.schedule.total_steps < 900
     slower = corrected(plan, 3, 3.0, 0.05)
-    assert slower.steps[:3] == plan.steps[:3]
-    assert sum(slower.steps[3:]) == pytest.approx(3.0 / 0.05, abs=2)
-    assert min(plan_for_budget(PLAN, 0.1, 5.0, 0.01).steps) == 1
+    assert slower.schedule.steps[:3] == plan.schedule.steps[:3]
+    assert sum(slower.schedule.steps[3:]) == pytest.approx(3.0 / 0.05, abs=2)
+    assert min(plan_for_budget(PLAN, 0.1, 5.0, 0.01).schedule.steps) == 1
 
 
 def test_densities_of_fine_levels_give_up_a_share_where_they_move():
     """p loses rate * decay * p, there and nowhere else, besides the step of a plan without decay."""
     steps, first = (1, 1, 5, 1, 1, 1, 1, 1), 3
-    plan = FastPlan(64, steps, num_chunks=4, samples_per_chunk=512, scout=False, immediate_levels=0, fine_decay=0.0)
-    moved = {}
+    plan = plan_of(
+        64, steps, num_chunks=4, samples_per_chunk=512, box_warm_up=False, immediate_levels=0, weight_decay=0.0
+    )
+    fields = {}
     with ThreadPoolExecutor(2) as executor:
         work = training(executor, plan)
         start, _ = run(work, work.start(), first)
         saved = {name: array.copy() for name, array in work.to_tensors(start).items()}
         before = work.from_tensors(saved).field.table.copy()
         for decay in (0.0, 0.5):
-            state = work.from_tensors(saved).with_plan(replace(plan, fine_decay=decay))
-            moved[decay] = work.step(state)[0].field
-    layout, rate = moved[0.0].layout, plan.density_rate * plan.rate_share(first)
+            state = work.from_tensors(saved).with_plan(plan.replaced(weight_decay=decay))
+            fields[decay] = work.advance(state)[0].field
+    layout, rate = fields[0.0].layout, plan.rates.density_rate * plan.rate_multiplier(first)
     assert layout.num_levels == 3
     for level in range(3):
-        old, plain, decayed = (layout.level(table, level) for table in (before, moved[0.0].table, moved[0.5].table))
+        old, plain, decayed = (layout.level(table, level) for table in (before, fields[0.0].table, fields[0.5].table))
         expected = plain.copy()
         touched = plain[..., 0] != old[..., 0]
         assert touched.any()

@@ -3,77 +3,85 @@
 import numpy as np
 import pytest
 
-from fast_scenes import random_field, random_rays
 from fieldstone.field.base.volume_rendering import composite
-from fieldstone.field.evidence.sparse_depth import no_known_rays
+from fieldstone.field.evidence.sparse_depth import no_sparse_depth_rays
+from fieldstone.field.grid.buffers import ray_buffers, sample_buffers, work_buffers
+from fieldstone.field.grid.composite_numba import composite_backward
 from fieldstone.field.grid.decoder import HIDDEN, Decoder, decode
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
-from fieldstone.field.grid.field import FOREVER, renderer, room_for_samples
+from fieldstone.field.grid.field import FOREVER
 from fieldstone.field.grid.interpolation_numba import BLOCK, add_gradient
 from fieldstone.field.grid.layout import interpolate
-from fieldstone.field.grid.march_numba import Samples, composite_backward, march_rays
-from fieldstone.field.grid.terms_numba import PointRays, point_terms
+from fieldstone.field.grid.march_numba import Samples, march_rays
+from fieldstone.field.grid.render import renderer
+from fieldstone.field.grid.terms_numba import SparseDepths, Terms, ray_terms
 from fieldstone.scene.rays import Rays
+from grid_scenes import random_field, random_rays
 
 ROOM = 4096
 
 
 def forward_and_backward(
-    field,
-    origins,
-    directions,
-    target,
-    background,
-    sparsity=0.0,
-    gain=None,
-    points=None,
-    point_weight=0.0,
-    emptiness=0.0,
-    free_weight=0.0,
+    field, origins, directions, target, background, gain=None, points=None, **terms
 ) -> tuple[float, Decoder, np.ndarray, Samples, int, np.ndarray]:
     """Squared colour errors, the gradient of the loss by group, the samples of all rays, and the gradient of gains.
 
-    points: (rows, PointRays), row of the known point on each ray; none by default.
+    points: (rows, SparseDepths), row of the point on each ray; none by default. terms: weights by name, 0 by default.
     """
     count = len(origins)
-    gain = np.ones((count, 3), np.float32) if gain is None else gain
-    rows, on_rays = points or (np.full(count, -1), no_known_rays()[1])
+    rows, sparse_depths = points or (np.full(count, -1), no_sparse_depth_rays()[1])
+    rays = ray_buffers(count)._replace(
+        origins=origins.reshape(-1),
+        directions=directions.reshape(-1),
+        target=target.reshape(-1),
+        background=background.reshape(-1),
+        gain=np.ones(3 * count, np.float32) if gain is None else gain.reshape(-1),
+        depth_row=rows,
+        free_distance=free_before(count),
+        jitter=np.full(count, 0.3, np.float32),
+    )
     grid, box, march = field.layout.arrays(field.table), field.box(), field.march(0.0, 0.0)
-    samples, width, used = room_for_samples(ROOM, field.width), field.width, 4 * field.layout.num_levels
-    first, passed = np.zeros(count + 1, np.int64), np.zeros(count, np.float32)
-    jitter = np.full(count, 0.3, np.float32)
-    rays, n, _ = march_rays(
+    samples, width, used = sample_buffers(ROOM, field.width), field.width, 4 * field.layout.num_levels
+    work = work_buffers(count, ROOM)
+    work.d_weight[:] = 7.0
+    num_rays, n, _ = march_rays(
         grid,
         box,
         march,
-        origins.reshape(-1),
-        directions.reshape(-1),
-        jitter,
+        rays.origins,
+        rays.directions,
+        rays.jitter,
         FOREVER,
         count,
         width,
         samples,
-        first,
-        passed,
+        rays.first,
+        rays.end_transmittance,
     )
-    assert rays == count
-    per_ray, hidden = np.zeros(count * HIDDEN, np.float32), np.zeros(ROOM * HIDDEN, np.float32)
-    rgb, d_color, d_raw = np.zeros(3 * ROOM, np.float32), np.zeros(3 * ROOM, np.float32), np.zeros(ROOM, np.float32)
-    decode_directions(field.decoder, directions.reshape(-1), count, per_ray)
-    decode_numba(field.decoder, n, samples.features, width, used, samples.ray, per_ray, hidden, rgb)
-    d_weight, d_gain = np.full(ROOM, 7.0, np.float32), np.zeros(3 * count, np.float32)
-    weights = np.float32(point_weight), np.float32(free_weight)
-    point_terms(samples, count, first, rows, free_before(count), on_rays, march.step, *weights, d_weight)
-    loss = composite_backward(
-        samples, count, first, passed, target.reshape(-1), background.reshape(-1), gain.reshape(-1), rgb, d_weight,
-        np.float32(2), np.float32(sparsity), np.float32(emptiness), d_color, d_raw, d_gain,
-    )  # fmt: skip
+    assert num_rays == count
+    decode_directions(field.decoder, rays.directions, count, work.per_ray)
+    decode_numba(field.decoder, n, samples.features, width, used, samples.ray, work.per_ray, work.hidden, work.rgb)
+    weights = Terms(**{name: np.float32(terms.get(name, 0.0)) for name in Terms._fields})
+    ray_terms(samples, rays, count, sparse_depths, march.step, weights, work.d_weight)
+    loss = composite_backward(samples, rays, work, count, weights, np.float32(2))
     gradient = Decoder(*(np.zeros_like(weights) for weights in field.decoder))
     transposed = np.ascontiguousarray(field.decoder.feature_weights.reshape(-1, HIDDEN).T).reshape(-1)
     decode_backward(
-        field.decoder, transposed, n, count, samples.features, width, used, samples.ray, directions.reshape(-1), hidden,
-        d_color, d_raw, np.zeros_like(per_ray), gradient,
-    )  # fmt: skip
+        field.decoder,
+        transposed,
+        n,
+        count,
+        samples.features,
+        width,
+        used,
+        samples.ray,
+        rays.directions,
+        work.hidden,
+        work.d_color,
+        work.d_log_density,
+        work.d_per_ray,
+        gradient,
+    )
     table = np.zeros(-(-field.layout.num_values // (8 * BLOCK)) * 8 * BLOCK, dtype=np.float32)
     touched = np.zeros(len(table) // BLOCK, dtype=np.uint8)
     for level in range(field.layout.num_levels):
@@ -81,7 +89,7 @@ def forward_and_backward(
             add_gradient(
                 grid, level, half, np.array([n]), ROOM, samples.position, samples.features, width, table, touched
             )
-    return loss, gradient, table[: field.layout.num_values], samples, n, d_gain.reshape(count, 3)
+    return loss, gradient, table[: field.layout.num_values], samples, n, work.d_gain.reshape(count, 3)
 
 
 @pytest.fixture
@@ -97,12 +105,12 @@ def relative_error(actual, expected):
     return np.linalg.norm(actual - expected) / np.linalg.norm(expected)
 
 
-def known_points(rng, directions) -> tuple[np.ndarray, PointRays]:
+def sparse_depths_on(rng, directions) -> tuple[np.ndarray, SparseDepths]:
     """Points on every other ray, some before the box and some behind it."""
     count = len(directions)
     rows = np.where(np.arange(count) % 2 == 0, np.arange(count) // 2, -1)
     distance, sigma = rng.uniform(2.5, 5.5, count // 2), rng.uniform(0.0, 0.1, count // 2)
-    return rows, PointRays(*np.stack([distance, sigma, np.ones(count // 2)]).astype(np.float32))
+    return rows, SparseDepths(*np.stack([distance, sigma, np.ones(count // 2)]).astype(np.float32))
 
 
 def free_before(count) -> np.ndarray:
@@ -110,7 +118,7 @@ def free_before(count) -> np.ndarray:
     return np.linspace(2.5, 5.5, count).astype(np.float32)
 
 
-def point_loss(points, samples, n, step, weight, free_weight) -> np.ndarray:
+def depth_loss(points, samples, n, step, sparse_depth, free_space) -> np.ndarray:
     """What the weight of each sample counts, by the definition."""
     rows, on_rays = points
     row = rows[samples.ray[:n]]
@@ -118,40 +126,49 @@ def point_loss(points, samples, n, step, weight, free_weight) -> np.ndarray:
     before = samples.distance[:n] < on_rays.distance[row] - margin
     there = (samples.distance[:n] <= on_rays.distance[row] + margin) & ~before
     early = samples.distance[:n] < free_before(len(rows))[samples.ray[:n]]
-    return np.where(row < 0, free_weight * early, weight * (before.astype(float) - there))
+    return np.where(row < 0, free_space * early, sparse_depth * (before.astype(float) - there))
 
 
 @pytest.mark.parametrize(
-    ("sparsity", "point_weight", "emptiness", "free_weight"),
+    ("sparsity", "sparse_depth", "emptiness", "free_space"),
     [(0.0, 0.0, 0.0, 0.0), (0.7, 0.0, 0.0, 0.0), (0.0, 0.4, 0.0, 0.0), (0.0, 0.0, 0.3, 0.0), (0.0, 0.4, 0.0, 0.2)],
 )
-def test_gradients_match_autograd(case, sparsity, point_weight, emptiness, free_weight):
+def test_gradients_match_autograd(case, sparsity, sparse_depth, emptiness, free_space):
     torch = pytest.importorskip("torch")
-    from fieldstone.field.grid_torch.field import optical_depths, packed_colors, packed_weights, torch_fast_field
+    from fieldstone.field.grid_torch.field import optical_depths, packed_colors, packed_weights, torch_grid_field
 
     field, _, directions, target, background = case
     bare = torch.arange(60) % 3 == 0
     rng = np.random.default_rng(4)
     gain = rng.uniform(0.7, 1.4, (60, 3)).astype(np.float32)
     target[::3] = background[::3]
-    points = known_points(rng, directions)
+    points = sparse_depths_on(rng, directions)
     loss, gradient, table, samples, n, d_gain = forward_and_backward(
-        *case, sparsity=sparsity, gain=gain, points=points, point_weight=point_weight, emptiness=emptiness,
-        free_weight=free_weight,
-    )  # fmt: skip
-    twin = torch_fast_field(field, torch.float64, torch.device("cpu"))
+        *case,
+        sparsity=sparsity,
+        gain=gain,
+        points=points,
+        sparse_depth=sparse_depth,
+        emptiness=emptiness,
+        free_space=free_space,
+    )
+    twin = torch_grid_field(field, torch.float64, torch.device("cpu"))
     positions = torch.tensor(samples.position[: 3 * n].reshape(-1, 3).astype(np.float64))
     ray = torch.tensor(samples.ray[:n].astype(np.int64))
     scale = float(field.march(0.0, 0.0).depth_scale)
     colors = packed_colors(
-        twin, positions, ray, torch.tensor(directions.astype(np.float64)),
-        torch.tensor(background.astype(np.float64)), scale,
-    )  # fmt: skip
+        twin,
+        positions,
+        ray,
+        torch.tensor(directions.astype(np.float64)),
+        torch.tensor(background.astype(np.float64)),
+        scale,
+    )
     weights = packed_weights(twin, positions, ray, len(directions), scale)
     theta = torch.tensor(np.log(gain.astype(np.float64)), requires_grad=True)
     squared = ((theta.exp() * colors - torch.tensor(target.astype(np.float64))) ** 2).sum()
     opacity = torch.zeros(60, dtype=torch.float64).index_add(0, ray, weights)
-    by_sample = point_loss(points, samples, n, float(field.march(0.0, 0.0).step), point_weight, free_weight)
+    by_sample = depth_loss(points, samples, n, float(field.march(0.0, 0.0).step), sparse_depth, free_space)
     depths = optical_depths(twin, positions, scale)
     total = squared + sparsity * opacity.sum() + (torch.tensor(by_sample) * weights).sum()
     total = total + emptiness * torch.log1p(depths[bare[ray]]).sum()
@@ -207,14 +224,14 @@ def test_rendering_is_the_integral_of_density_and_color():
     """A ray's colour from the kernels equals the sum over the same positions with the readable density and colour."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from fast_scenes import FRAME
+    from grid_scenes import FRAME
 
     rng = np.random.default_rng(5)
     field = random_field(rng)
     origins, directions = random_rays(rng, field, 20)
     rays = Rays(origins.astype(np.float64), directions.astype(np.float64), np.zeros(20))
     with ThreadPoolExecutor(1) as executor:
-        rendered = renderer(field, FRAME, executor, min_weight=0.0, min_light=0.0)(rays)
+        rendered = renderer(field, FRAME, executor, min_weight=0.0, early_stop_eps=0.0)(rays)
     step = float(field.march(0.0, 0.0).step)
     for n in range(20):
         low = (field.occupancy.lower - rays.origins[n]) / rays.directions[n]

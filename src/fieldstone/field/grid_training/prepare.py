@@ -1,0 +1,133 @@
+"""Posed photos and triangulated points to a training of the grid field: space, occupancy and rays of the start."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+
+import numpy as np
+from jaxtyping import Float
+
+from fieldstone.errors import InputError
+from fieldstone.field.base.projection import projection_for
+from fieldstone.field.base.radiance_field import FieldFrame
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.base.space import Space, box_space, contracted_space, grid_from_normalized, projective_space
+from fieldstone.field.evidence.free_space import carve_free_space, free_distances
+from fieldstone.field.evidence.pose_refinement import refinable_photos
+from fieldstone.field.evidence.sparse_depth import no_sparse_depth_rays, sparse_depth_rays
+from fieldstone.field.grid.field import occupancy_box
+from fieldstone.field.grid.occupancy import Occupancy, full_box, visual_hull
+from fieldstone.field.grid.rays import ray_table
+from fieldstone.field.grid_training.plan import GridPlan
+from fieldstone.field.grid_training.training import GridTraining
+from fieldstone.geometry.rigid3 import Rigid3
+
+logger = logging.getLogger(__name__)
+
+HULL_CELLS = 96
+"""Cells of the visual hull along the longest side of the box."""
+
+OPEN_CELLS = 64
+"""Cells of an open space along the longest side, before training."""
+
+
+def prepare_grid_training(
+    images: tuple[PosedImage, ...],
+    frame: FieldFrame,
+    plan: GridPlan,
+    *,
+    seed: int,
+    executor: Executor,
+    use_alpha: bool = True,
+    points_in_world: Float[np.ndarray, "p 3"] | None = None,
+    seen: Mapping[str, SeenPoints] | None = None,
+    bounded: bool = True,
+    refine_poses: bool = False,
+) -> GridTraining:
+    """The training of a grid field on posed photos.
+
+    The box is `NORMALIZED_RADIUS` around the origin of the frame. Where photos have alpha, it shrinks to the visual
+    hull. An open scene whose photos look the same way gets a projective space; in others everything beyond the box is
+    contracted into a shell around it.
+
+    Args:
+        points_in_world: Triangulated points, which tell how near things are.
+        seen: Those that each photo observes, by its name.
+        bounded: Nothing lies beyond the box.
+        use_alpha: False takes photos with alpha as photos on the background of the frame.
+        refine_poses: Keep what a plan with `refine_poses` needs.
+
+    Raises:
+        InputError: No ray meets the scene.
+    """
+    points = np.empty((0, 3)) if points_in_world is None else points_in_world
+    space, bounds = space_of(images, frame, points, bounded=bounded)
+    occupancy = full_box(bounds[0], bounds[1] - bounds[0], HULL_CELLS // 2 if bounded else OPEN_CELLS)
+    alpha_known = use_alpha and all(image.pixels.shape[2] == 4 for image in images)
+    if alpha_known and bounded:
+        occupancy = _hull(occupancy, images, frame, executor)
+    depth_rays, sparse_depths = no_sparse_depth_rays()
+    free_distance_of = None
+    if seen:
+        occupancy = carve_free_space(occupancy, images, frame, seen, space, executor)
+        logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
+        depth_rays, sparse_depths = sparse_depth_rays(images, frame, seen, space)
+        free_distance_of = None if space.is_projective else free_distances(frame, seen)
+    box = occupancy_box(occupancy, occupancy.extent, space)
+    return GridTraining(
+        rays=ray_table(images, frame, box, executor, use_alpha=use_alpha, free_distance_of=free_distance_of),
+        depth_rays=depth_rays,
+        sparse_depths=sparse_depths,
+        frame=frame,
+        occupancy=occupancy,
+        space=space,
+        plan=plan,
+        seed=seed,
+        executor=executor,
+        points_in_grid=grid_from_normalized(space, frame.normalized_from_world.apply(points)),
+        alpha_known=alpha_known,
+        refinable=refinable_photos(images, frame, seen) if refine_poses else (),
+    )
+
+
+def space_of(
+    images: Sequence[PosedImage], frame: FieldFrame, points_in_world: Float[np.ndarray, "p 3"], *, bounded: bool
+) -> tuple[Space, Float[np.ndarray, "2 3"]]:
+    """The space that suits a scene, and the lower and upper corner of its grid."""
+    cube = NORMALIZED_RADIUS * np.array([[-1.0] * 3, [1.0] * 3])
+    if bounded:
+        return box_space(), cube
+    projected = projection_for(images, frame, points_in_world)
+    if projected is None:
+        return contracted_space(), 2.0 * cube
+    projection, bounds = projected
+    return projective_space(projection), bounds
+
+
+def _hull(box: Occupancy, images: Sequence[PosedImage], frame: FieldFrame, executor: Executor) -> Occupancy:
+    """The visual hull of photos with alpha.
+
+    Raises:
+        InputError: It is empty.
+    """
+    masks = [image.pixels[:, :, 3] > 0 for image in images]
+    if not any(mask.any() for mask in masks):
+        raise InputError("all photos are fully transparent: their alpha is 0 everywhere; train without alpha")
+    poses = [_cam_from_normalized(image.cam_from_world, frame) for image in images]
+    occupancy = visual_hull(box, masks, [image.camera for image in images], poses, HULL_CELLS, executor).trimmed()
+    logger.info("visual hull: %.1f %% of a box of %s", 100 * occupancy.cells.mean(), occupancy.extent.round(3))
+    if not occupancy.cells.any():
+        raise InputError(
+            "the alpha masks leave nothing: no point lies on opaque pixels in all photos that show it; check that "
+            "alpha is 255 on the object and that the poses belong to the photos, or train without alpha"
+        )
+    return occupancy
+
+
+def _cam_from_normalized(cam_from_world: Rigid3, frame: FieldFrame) -> Rigid3:
+    """Pose of a camera in the frame; lengths are those of the frame."""
+    world = frame.normalized_from_world
+    R = cam_from_world.R @ world.R.T
+    return Rigid3(R, -R @ world.apply(cam_from_world.target_origin_in_source()))
