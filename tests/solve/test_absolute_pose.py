@@ -8,6 +8,7 @@ from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
 from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose, plane_to_pixels, squared_errors
+from fieldstone.solve.robust.early_test_numba import ACCEPT_ALL
 from fieldstone.solve.robust.ransac import RansacOptions
 from fieldstone.solve.robust.reprojection_numba import BLOCK, pose_normal_equations_numba, score_pose_numba
 from matchers import assert_rigid3_near, check_jacobian
@@ -109,7 +110,7 @@ def test_errors_are_those_of_the_lens():
 def test_score_is_the_truncated_sum(n, kernel):
     pose, data = kernel_data(LENS, n, np.random.default_rng(6))
     errors = squared_errors(pose, data)
-    cost, inliers, seen = kernel(pose, data, 4.0, np.inf, 0.0, 0.0, np.inf)
+    cost, inliers, seen = kernel(pose, data, 4.0, np.inf, ACCEPT_ALL)
     np.testing.assert_allclose(cost, np.minimum(errors, 4.0).sum(), rtol=1e-9)
     assert (inliers, seen) == ((errors < 4.0).sum(), n)
 

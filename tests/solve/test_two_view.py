@@ -8,6 +8,7 @@ from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.epipolar import essential_from_pose, homogeneous, poses_from_essential, sampson_error
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp
+from fieldstone.solve.robust.early_test_numba import ACCEPT_ALL
 from fieldstone.solve.robust.epipolar_numba import (
     BLOCK,
     epipolar_errors_numba,
@@ -127,7 +128,7 @@ def test_errors_are_sampson_errors_in_pixels():
 def test_score_is_the_truncated_sum(n, kernel):
     truth, data = kernel_data(n, np.random.default_rng(5))
     errors = errors_of(essential_from_pose(truth), data)
-    cost, inliers, seen = kernel(essential_from_pose(truth).ravel(), data, 4.0, np.inf, 0.0, 0.0, np.inf)
+    cost, inliers, seen = kernel(essential_from_pose(truth).ravel(), data, 4.0, np.inf, ACCEPT_ALL)
     np.testing.assert_allclose(cost, np.minimum(errors, 4.0).sum(), rtol=1e-9)
     assert (inliers, seen) == ((errors < 4.0).sum(), n)
 

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 
 from fieldstone.geometry.camera import Camera, plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.solve.robust.consensus_numba import POSE, consensus_numba, refine_model_numba
+from fieldstone.solve.robust.consensus_models_numba import POSE, refine_model_numba
+from fieldstone.solve.robust.consensus_numba import consensus_numba
 from fieldstone.solve.robust.ransac import RansacOptions
-from fieldstone.solve.robust.sampling import kernel_seed, soft_scale
+from fieldstone.solve.robust.sampling import sampling_of, soft_scale
 
 LOCAL_STEPS = 8
 # Scale of the last, soft refinement: per noise of the inliers, and at most this multiple of the threshold. Wider than
@@ -67,9 +68,8 @@ def estimate_absolute_pose(
     threshold2 = options.max_error_px**2
     pose = np.empty(12)
     cost, num_inliers, trials = consensus_numba(
-        POSE, data, np.arange(len(rows)), False, threshold2, options.confidence, options.min_trials,
-        options.max_trials, LOCAL_STEPS, kernel_seed(rng), pose,
-    )  # fmt: skip
+        POSE, data, sampling_of(options, rng, np.arange(len(rows)), LOCAL_STEPS), threshold2, pose
+    )
     if not np.isfinite(cost) or num_inliers < 4:
         return None
     scale = soft_scale(

@@ -45,7 +45,7 @@ def _score_block(M, data, begin, end, threshold2, costs):  # -> truncated cost, 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def score_epipolar_numba(M, data, threshold2, max_cost, gain_in, gain_out, log_limit):
+def score_epipolar_numba(M, data, threshold2, max_cost, early_test):
     """Truncated cost, inliers and matches looked at; the cost is inf where M was rejected before the end.
 
     As `reprojection_numba.score_pose_numba`.
@@ -58,8 +58,8 @@ def score_epipolar_numba(M, data, threshold2, max_cost, gain_in, gain_out, log_l
         block_cost, block_inliers = _score_block(M, data, begin, end, threshold2, costs)
         cost += block_cost
         inliers += block_inliers
-        log_ratio = inliers * gain_in + (end - inliers) * gain_out
-        if end < n and (cost > max_cost or log_ratio > log_limit):
+        log_ratio = inliers * early_test.gain_in + (end - inliers) * early_test.gain_out
+        if end < n and (cost > max_cost or log_ratio > early_test.log_limit):
             return np.inf, inliers, end
     return cost, inliers, n
 

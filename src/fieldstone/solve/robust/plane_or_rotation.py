@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
-from fieldstone.solve.robust.consensus_numba import HOMOGRAPHY, consensus_numba
+from fieldstone.solve.robust.consensus_models_numba import HOMOGRAPHY
+from fieldstone.solve.robust.consensus_numba import consensus_numba
 from fieldstone.solve.robust.ransac import RansacOptions
-from fieldstone.solve.robust.sampling import kernel_seed
+from fieldstone.solve.robust.sampling import sampling_of
 
 HOMOGRAPHY_TRIALS = 12
 LOCAL_STEPS = 3
@@ -42,11 +45,9 @@ def find_homography(
     if count < 4:
         return None
     best = np.zeros(12)
-    cost, _, _ = consensus_numba(
-        HOMOGRAPHY, data, np.arange(count), False, options.max_error_px**2, options.confidence,
-        min(HOMOGRAPHY_TRIALS, options.max_trials), min(HOMOGRAPHY_TRIALS, options.max_trials), LOCAL_STEPS,
-        kernel_seed(rng), best,
-    )  # fmt: skip
+    few = min(HOMOGRAPHY_TRIALS, options.max_trials)
+    sampling = sampling_of(replace(options, min_trials=few, max_trials=few), rng, np.arange(count), LOCAL_STEPS)
+    cost, _, _ = consensus_numba(HOMOGRAPHY, data, sampling, options.max_error_px**2, best)
     return best[:9].reshape(3, 3) if np.isfinite(cost) else None
 
 

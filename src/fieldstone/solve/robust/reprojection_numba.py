@@ -53,11 +53,10 @@ def _score_block(pose, data, begin, end, threshold2, costs):  # -> truncated cos
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def score_pose_numba(pose, data, threshold2, max_cost, gain_in, gain_out, log_limit):
+def score_pose_numba(pose, data, threshold2, max_cost, early_test):
     """Truncated cost, inliers and points looked at; the cost is inf where the pose was rejected before the end.
 
-    Rejected: the cost passes `max_cost`, or the sequential probability ratio test (`gain_in` is added for an inlier,
-    `gain_out` for an outlier) passes `log_limit`.
+    Rejected: the cost passes `max_cost`, or the sequential probability ratio test (`EarlyTest`) does.
 
     Source:
         `matas2005` for the test; in blocks of points rather than after every point.
@@ -70,8 +69,8 @@ def score_pose_numba(pose, data, threshold2, max_cost, gain_in, gain_out, log_li
         block_cost, block_inliers = _score_block(pose, data, begin, end, threshold2, costs)
         cost += block_cost
         inliers += block_inliers
-        log_ratio = inliers * gain_in + (end - inliers) * gain_out
-        if end < n and (cost > max_cost or log_ratio > log_limit):
+        log_ratio = inliers * early_test.gain_in + (end - inliers) * early_test.gain_out
+        if end < n and (cost > max_cost or log_ratio > early_test.log_limit):
             return np.inf, inliers, end
     return cost, inliers, n
 

@@ -1,16 +1,34 @@
-"""What every robust estimator decides outside of its compiled loop: the seed, and the scale of the last refinement."""
+"""What robust estimators decide outside of their compiled loop: the samples, and the scale of the last refinement."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from fieldstone.solve.robust.consensus_numba import Sampling
+from fieldstone.solve.robust.ransac import RansacOptions
 
 SIGMA_PER_MEDIAN = 1.4826
 
 
-def kernel_seed(rng: np.random.Generator) -> np.uint64:
-    """Seed of a kernel's own generator, the next draw of `rng`."""
-    return np.uint64(rng.integers(0, 2**63))
+def sampling_of(
+    options: RansacOptions,
+    rng: np.random.Generator,
+    pool: Int[np.ndarray, "p"],
+    local_steps: int,
+    *,
+    progressive: bool = False,
+) -> Sampling:
+    """Samples from a pool as the options say; the seed of the kernel's own generator is the next draw of `rng`."""
+    return Sampling(
+        pool=pool,
+        progressive=progressive,
+        confidence=float(options.confidence),
+        min_trials=int(options.min_trials),
+        max_trials=int(options.max_trials),
+        local_steps=local_steps,
+        seed=np.uint64(rng.integers(0, 2**63)),
+    )
 
 
 def soft_scale(squared_errors: Float[np.ndarray, "n"], max_error_px: float, per_sigma: float, limit: float) -> float:

@@ -11,13 +11,8 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.epipolar import essential_from_pose, fundamental_from_essential
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.match_graph import TwoView
-from fieldstone.solve.robust.consensus_numba import (
-    ESSENTIAL,
-    FUNDAMENTAL,
-    PARALLAX,
-    consensus_numba,
-    refine_model_numba,
-)
+from fieldstone.solve.robust.consensus_models_numba import ESSENTIAL, FUNDAMENTAL, PARALLAX, refine_model_numba
+from fieldstone.solve.robust.consensus_numba import consensus_numba
 from fieldstone.solve.robust.epipolar_numba import epipolar_errors_numba
 from fieldstone.solve.robust.essential_numba import choose_pose_numba, essential_from_state_numba
 from fieldstone.solve.robust.match_data import MatchData, match_data
@@ -28,13 +23,13 @@ from fieldstone.solve.robust.plane_or_rotation import (
     transfer_errors,
 )
 from fieldstone.solve.robust.ransac import RansacOptions
-from fieldstone.solve.robust.sampling import kernel_seed, soft_scale
+from fieldstone.solve.robust.sampling import sampling_of, soft_scale
 
 LOCAL_STEPS = 8
 FINAL_STEPS, FINAL_TOLERANCE = 30, 1e-9
-# Scale of the last, soft refinement: per noise of the inliers, and at most this share of the threshold.
+# Scale of the last, soft refinement: per noise of the inliers, and at most this fraction of the threshold.
 SCALE_PER_SIGMA, SCALE_LIMIT = 2.0, 0.5
-# A plane that holds this share of F's inliers may have decided F alone.
+# A plane that holds this fraction of F's inliers may have decided F alone.
 DOMINANT_PLANE = 0.5
 
 
@@ -49,9 +44,9 @@ class TwoViewOptions:
     focal_known: bool = True
     """Estimate E; otherwise F, with the cameras' focal lengths used for nothing but scale."""
     planar_ratio: float = 0.8
-    """Planar, if one homography holds for this share of the inliers."""
+    """Planar, if one homography holds for this fraction of the inliers."""
     panoramic_ratio: float = 0.9
-    """Panoramic, if a rotation alone holds for this share of the inliers."""
+    """Panoramic, if a rotation alone holds for this fraction of the inliers."""
 
 
 def estimate_two_view(
@@ -216,8 +211,6 @@ def _consensus(kind: int, data, ranked, options: RansacOptions, rng, model, pool
     progressive = ranked is not None
     if pool is None:
         pool = ranked if progressive else np.arange(data.shape[1])
-    cost, _, _ = consensus_numba(
-        kind, data, pool, progressive, options.max_error_px**2, options.confidence, options.min_trials,
-        options.max_trials, LOCAL_STEPS, kernel_seed(rng), model,
-    )  # fmt: skip
+    sampling = sampling_of(options, rng, pool, LOCAL_STEPS, progressive=progressive)
+    cost, _, _ = consensus_numba(kind, data, sampling, options.max_error_px**2, model)
     return cost
