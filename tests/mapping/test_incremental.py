@@ -106,6 +106,28 @@ def test_progress_counts_photos_and_models(mapper):
         assert {e.total for e in events if e.stage == stage} == {total}
 
 
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_photos_of_more_pixels_than_the_detector_saw_give_the_same_model(mapper):
+    """The same photos with twice or three times the pixels: thresholds grow with them, focal length and noise too."""
+    scene = scene_of(outlier_share=0.2)
+    zoom = np.where(np.arange(8) < 5, 2.0, 3.0)
+    cameras = tuple(Camera("PINHOLE", 1000 * z, 750 * z, z * OFF_CENTER.params) for z in (2, 3))
+    larger = replace(
+        scene.graph, keypoints=tuple(k * z for k, z in zip(scene.graph.keypoints, zoom, strict=True)), pixel_scale=zoom
+    )
+    camera_of_image, options = (zoom == 3.0).astype(np.int64), AutomaticOptions(mapper=mapper, covariance=True)
+    graph = verify_pairs(larger, cameras, camera_of_image, TwoViewOptions(), 0, 2)
+    run = map_automatic(graph, cameras, camera_of_image, np.array([True, True]), options, 0)
+    plain = verify_pairs(scene.graph, [OFF_CENTER] * 2, camera_of_image, TwoViewOptions(), 0, 2)
+    expected = map_automatic(plain, [OFF_CENTER] * 2, camera_of_image, np.array([True, True]), options, 0)
+    assert_reconstruction_near(run.reconstruction, expected.reconstruction, angle_deg=1e-4, relative_distance=1e-5)
+    assert len(run.reconstruction.observations) == len(expected.reconstruction.observations)
+    assert run.uncertainty is not None
+    assert expected.uncertainty is not None
+    np.testing.assert_allclose(run.uncertainty.rotation_deg, expected.uncertainty.rotation_deg, rtol=1e-3)
+    assert run.uncertainty.sigma_px == pytest.approx(2.0 * expected.uncertainty.sigma_px, rel=1e-3)
+
+
 def test_two_unrelated_scenes_become_two_models():
     a, b = scene_of(1, num_cameras=6), scene_of(2, num_cameras=4)
     graph = MatchGraph(

@@ -49,10 +49,14 @@ def two_views_of_pairs(
 ) -> Iterator[TwoView]:
     """Geometry of these pairs, in their order, each as soon as it is known."""
 
+    scale = graph.scale_of_image
+
     def verify(pair: ImagePair) -> TwoView:
         camera1, camera2 = (cameras[camera_of_image[k]] for k in pair)
         pixels1, pixels2 = graph.matched_pixels(pair)
-        return estimate_two_view(camera1, camera2, pixels1, pixels2, options, np.random.default_rng([seed, *pair]))
+        scales = float(scale[pair[0]]), float(scale[pair[1]])
+        rng = np.random.default_rng([seed, *pair])
+        return estimate_two_view(camera1, camera2, pixels1, pixels2, options, rng, pixel_scales=scales)
 
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(verify, pairs)
@@ -76,13 +80,14 @@ def calibrate_from_pairs(
     pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:max_pairs]
     unit, (cx, cy) = float(max(camera.width, camera.height)), camera.principal_point
     pixels_from_unit = np.array([[unit, 0.0, cx], [0.0, unit, cy], [0.0, 0.0, 1.0]])
-    uncalibrated = replace(options, focal_known=False)
+    uncalibrated, scale = replace(options, focal_known=False), graph.scale_of_image
 
     def geometry(pair: ImagePair) -> tuple[bool, Float[np.ndarray, "3 3"], float] | None:
         """Whether the pair has a fundamental matrix rather than a homography, the matrix, its number of inliers."""
         pixels1, pixels2 = graph.matched_pixels(pair)
         rng = np.random.default_rng([seed, *pair])
-        found = estimate_two_view(camera, camera, pixels1, pixels2, uncalibrated, rng)
+        scales = float(scale[pair[0]]), float(scale[pair[1]])
+        found = estimate_two_view(camera, camera, pixels1, pixels2, uncalibrated, rng, pixel_scales=scales)
         inliers = float(found.inliers.sum())
         if found.kind == "uncalibrated":
             return True, pixels_from_unit.T @ found.matrix @ pixels_from_unit, inliers

@@ -144,7 +144,9 @@ def _place(
     # All matches make the points: those of a dropped pair may be right, and are judged one by one.
     tracks, _ = build_tracks(graph, split_conflicts=True)
     views, cam_from_world = poses
-    model = WorkingModel.start(tuple(cameras), camera_of_image, tracks).with_poses(views, cam_from_world)
+    model = WorkingModel.start(tuple(cameras), camera_of_image, tracks, graph.pixel_scale).with_poses(
+        views, cam_from_world
+    )
     strict = RETRY_STAGES[0]
     for tolerance in TOLERANCES:
         error = tolerance * options.max_error_px
@@ -188,7 +190,7 @@ def _positions(
 ) -> tuple[Int[np.ndarray, "k"], Rigid3] | None:
     """The photos that the covering tracks hold and their poses; None if there are no such tracks."""
     tracks, _ = build_tracks(graph, split_conflicts=True)
-    model = WorkingModel.start(tuple(cameras), camera_of_image, tracks)
+    model = WorkingModel.start(tuple(cameras), camera_of_image, tracks, graph.pixel_scale)
     R = np.array(list(rotations.values()))
     model = model.with_poses(np.array(list(rotations)), Rigid3(R, np.zeros((len(R), 3))))
     long = np.bincount(tracks.point, minlength=len(model.xyz)) >= MIN_TRACK_LENGTH

@@ -78,7 +78,7 @@ def select_camera_models(
         () if step is None else richer_steps(step, principal_point=options.principal_point) for step in calibration
     ]
     fitted = adjust_globally(model, refinement, best, bundle=refinement.final, points=learners)
-    loss = cauchy(refinement.final.loss_scale_px)
+    loss, unit = cauchy(refinement.final.loss_scale_px), model.typical_pixel_scale()
 
     def badness(model: WorkingModel) -> Float[np.ndarray, "k"]:
         return loss(np.minimum(prediction_errors(model, rows, predictions), options.max_error_px) ** 2)[0]
@@ -97,14 +97,11 @@ def select_camera_models(
         significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
         clear = gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance
         accepted = bool(clear or (_num_free(candidate) < _num_free(best) and gain.mean() > 0.0))
-        trials.append(
-            CalibrationTrial(
-                step, float(np.sqrt(errors.mean())), float(np.sqrt(new_errors.mean())), significance, accepted
-            )
-        )
+        rms_before_px, rms_after_px = (unit * float(np.sqrt(e.mean())) for e in (errors, new_errors))
+        trials.append(CalibrationTrial(step, rms_before_px, rms_after_px, significance, accepted))
         logger.info(
             "calibration %s %s: predicts to %.4f px instead of %.4f px, %.1f standard errors, %s",
-            step.model, "/".join(step.free), np.sqrt(new_errors.mean()), np.sqrt(errors.mean()), significance,
+            step.model, "/".join(step.free), rms_after_px, rms_before_px, significance,
             "accepted" if accepted else "refused",
         )  # fmt: skip
         if accepted:
@@ -130,15 +127,14 @@ class _Predictions:
 def prediction_errors(
     model: WorkingModel, rows: Int[np.ndarray, "u"], predictions: _Predictions
 ) -> Float[np.ndarray, "k"]:
-    """Distance in pixels of each target to the reprojection of the point that the others of its track give.
+    """Distance of each target to the reprojection of the point that the others of its track give, over the pixel scale.
 
     inf where they give none.
     """
     uv = plane_coordinates(model, rows)[predictions.members]
-    focal = np.array([model.camera_of(v).focal.mean() for v in range(model.num_views)])
     points, _ = triangulate_robust(
         model.cam_from_world,
-        focal,
+        model.scaled_focals(),
         model.tracks.view[rows[predictions.members]],
         uv,
         predictions.starts,
@@ -153,7 +149,7 @@ def prediction_errors(
         mine = model.camera_of_view[view] == c
         predicted = image_from_cam(camera, in_cam[mine])
         out[mine] = np.linalg.norm(predicted - model.tracks.pixels[target_rows[mine]], axis=1)
-    return np.nan_to_num(out, nan=np.inf)
+    return np.nan_to_num(out, nan=np.inf) / model.pixel_scale[view]
 
 
 def _held_out(model: WorkingModel, share: float, rng: np.random.Generator) -> Bool[np.ndarray, "t"]:

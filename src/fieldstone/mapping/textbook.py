@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Int
@@ -62,6 +62,17 @@ class TextbookOptions:
             raise ValueError("a pose needs at least 6 inliers, a fundamental matrix 8")
         if not (self.max_error_px > 0 and self.min_angle_deg >= 0 and self.robust_scale_px > 0):
             raise ValueError("max_error_px and robust_scale_px must be positive, min_angle_deg not negative")
+
+
+def for_pixel_scale(options: TextbookOptions, scale: float) -> TextbookOptions:
+    """The same thresholds for photos with so many pixels per pixel of the detector."""
+    return replace(
+        options,
+        two_view=replace(options.two_view, max_error_px=scale * options.two_view.max_error_px),
+        pnp=replace(options.pnp, max_error_px=scale * options.pnp.max_error_px),
+        max_error_px=scale * options.max_error_px,
+        robust_scale_px=scale * options.robust_scale_px,
+    )
 
 
 def map_textbook(

@@ -16,7 +16,7 @@ from fieldstone.mapping.incremental.checkpoint import CheckpointStore
 from fieldstone.mapping.incremental.mapper import continue_with_graph
 from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.incremental.state import SubModel
-from fieldstone.mapping.textbook import TextbookOptions, map_textbook
+from fieldstone.mapping.textbook import TextbookOptions, for_pixel_scale, map_textbook
 from fieldstone.progress import OnProgress, silent
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
@@ -76,8 +76,12 @@ def map_given_matches(
 
 
 def map_with_textbook(matched: MatchedPhotos, options: TextbookOptions, seed: int) -> MappingRun:
-    """The textbook mapper on the same matches; focal lengths are refined where they are not exact."""
-    textbook = replace(options, refine_focal=not matched.known.all())
+    """The textbook mapper on the same matches; focal lengths are refined where they are not exact.
+
+    It has one threshold for all photos: that of the largest.
+    """
+    scale = float(matched.graph.scale_of_image.max(initial=1.0))
+    textbook = for_pixel_scale(replace(options, refine_focal=not matched.known.all()), scale)
     return map_textbook(matched.graph, matched.cameras, matched.camera_of_image, textbook, seed)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from fieldstone.run.mapper_checkpoint import MapperCheckpoints
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_course
 from fieldstone.run.reconstruct_options import ReconstructOptions
 from fieldstone.run.scene import Scene, sizes_of, summary_of, write_scene
-from fieldstone.scene.mapping_run import MappingRun, StageRecord
+from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.reconstruction import View
 
 HOW_ERRORS_ARE_COUNTED = (
@@ -114,7 +113,6 @@ def _reconstructed(
     on_matched(photos)
     start = time.perf_counter()
     mapper, run = run_mapper(photos, options, MapperCheckpoints(cache), on_progress, given=given)
-    run = full_size(run, photos)
     seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
     record = run_record(source, mapper, run, photos, options.seed, seconds)
     return Scene(record, run, photos.photo_of, source, options.masks)
@@ -142,28 +140,6 @@ def run_mapper(
     if options.mapper == "textbook":
         return "textbook", map_with_textbook(photos, textbook, seed)
     return mapping.mapper, map_photos(photos, options.matching(), mapping, seed, checkpoints, on_progress)
-
-
-def full_size(run: MappingRun, matched: MatchedPhotos) -> MappingRun:
-    """The run in the pixels of the photos: models, matches and records."""
-    factor = matched.pixel_factors()
-    model = matched.full_size(run.reconstruction)
-    camera_of_image = np.array([view.camera for view in model.views], dtype=np.int64)
-    scale = factor[camera_of_image]
-
-    def scaled(record: StageRecord) -> StageRecord:
-        by = scale[record.view]
-        return replace(record, pixels=record.pixels * by, reprojected=record.reprojected * by)
-
-    graph = replace(run.graph, keypoints=tuple(k * s for k, s in zip(run.graph.keypoints, scale, strict=True)))
-    return replace(
-        run,
-        reconstruction=model,
-        graph=graph,
-        records=tuple(scaled(record) for record in run.records),
-        before_bundle=None if run.before_bundle is None else matched.full_size(run.before_bundle),
-        others=tuple(matched.full_size(other) for other in run.others),
-    )
 
 
 def run_record(

@@ -73,7 +73,7 @@ class Uncertainty:
     of_points: Float[np.ndarray, "p 3 3"]
     """Covariances, in the order of the reconstruction's points."""
     sigma_px: float
-    """Standard deviation of an observation per axis, estimated from the errors that are left; working pixels."""
+    """Standard deviation of an observation per axis, estimated from the errors that are left; pixels of the photos."""
     rotation_deg: Float[np.ndarray, "v"]
     """Standard deviations: the root of the summed variances."""
     center: Float[np.ndarray, "v"]

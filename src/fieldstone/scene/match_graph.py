@@ -37,7 +37,9 @@ class MatchGraph:
 
     matches: row (a, b) says that keypoint a of photo i and keypoint b of photo j may show one point. They are
     putative: `inlier_matches` gives those that agree with the pair's `TwoView` geometry, where there is one.
-    keypoints are in pixels, corner convention.
+    keypoints are in pixels of the photo, corner convention.
+    pixel_scale: per photo, how many of its pixels count as one in every threshold and error: pixels of the photo per
+    pixel of the detector, which worked on a reduced photo. None: one everywhere.
     """
 
     names: tuple[str, ...]
@@ -45,6 +47,7 @@ class MatchGraph:
     colors: tuple[UInt8[np.ndarray, "_ 3"], ...]
     matches: Mapping[ImagePair, Int[np.ndarray, "_ 2"]]
     two_views: Mapping[ImagePair, TwoView] = field(default_factory=dict)
+    pixel_scale: Float[np.ndarray, "n"] | None = None
 
     def __post_init__(self) -> None:
         if not len(self.names) == len(self.keypoints) == len(self.colors):
@@ -52,6 +55,8 @@ class MatchGraph:
                 f"a match graph needs one name, keypoint and colour array per photo, got "
                 f"{len(self.names)}, {len(self.keypoints)}, {len(self.colors)}"
             )
+        if self.pixel_scale is not None and self.pixel_scale.shape != (len(self.names),):
+            raise ValueError(f"{len(self.names)} photos need as many pixel scales, got {self.pixel_scale.shape}")
         for i, j in self.matches:
             if not 0 <= i < j < len(self.names):
                 raise ValueError(f"pair ({i}, {j}) is not two photos i < j of {len(self.names)}")
@@ -60,6 +65,11 @@ class MatchGraph:
     def num_images(self) -> int:
         """Number of photos, matched or not."""
         return len(self.names)
+
+    @property
+    def scale_of_image(self) -> Float[np.ndarray, "n"]:
+        """`pixel_scale`, with the ones that None stands for."""
+        return np.ones(self.num_images) if self.pixel_scale is None else self.pixel_scale
 
     def inlier_matches(self, pair: ImagePair) -> Int[np.ndarray, "m 2"]:
         """Matches that agree with the pair's geometry; all of them while it has none."""

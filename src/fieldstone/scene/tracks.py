@@ -68,17 +68,18 @@ def build_tracks(
         return Observations.empty(), TrackStatistics(0, 0, 0, 0)
     view = np.repeat(np.arange(graph.num_images), np.diff(offsets))
     pixels = np.concatenate([k for k in graph.keypoints if len(k)])
+    scaled = pixels / graph.scale_of_image[view, None]
     label = _components(edges, int(offsets[-1]))
     used = np.unique(edges)
-    conflicting = _conflicts(label, view, pixels, used, max_duplicate_distance_px)
+    conflicting = _conflicts(label, view, scaled, used, max_duplicate_distance_px)
     dropped = int(np.sum(conflicting))
     if split_conflicts and dropped:
         inside = conflicting[label[edges[:, 0]]]
-        joined = _joinable(edges[inside], view, pixels, max_duplicate_distance_px)
+        joined = _joinable(edges[inside], view, scaled, max_duplicate_distance_px)
         edges = np.concatenate([edges[~inside], edges[inside][joined]])
         label = _components(edges, int(offsets[-1]))
         used = np.unique(edges)
-        conflicting = _conflicts(label, view, pixels, used, max_duplicate_distance_px)
+        conflicting = _conflicts(label, view, scaled, used, max_duplicate_distance_px)
 
     track = _number_by_first_member(label[used])
     order = np.lexsort((used, track))

@@ -59,7 +59,7 @@ def map_incremental(
         Models that share no photo, before the final refinement; empty if no pair gives a start.
     """
     tracks, _ = build_tracks(graph, split_conflicts=True)
-    empty = WorkingModel.start(tuple(cameras), camera_of_image, tracks)
+    empty = WorkingModel.start(tuple(cameras), camera_of_image, tracks, graph.pixel_scale)
     progress = StageProgress(on_progress, "registering photos", graph.num_images)
     available = np.ones(graph.num_images, dtype=bool)
     sub_models: list[SubModel] = []

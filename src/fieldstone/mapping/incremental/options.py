@@ -34,7 +34,8 @@ class IncrementalOptions:
     """How photos are registered one after the other."""
 
     max_error_px: float = 4.0
-    """Observations with a larger reprojection error are no inliers of their point; pixels of the matched photos."""
+    """Observations with a larger reprojection error are no inliers of their point. Like every number of pixels here, it
+    is multiplied by the pixel scale of the photo."""
     pnp: RansacOptions = field(default_factory=lambda: RansacOptions(max_error_px=8.0))
     """Registration of a photo."""
     refinement: RefinementOptions = field(default_factory=RefinementOptions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,7 @@ def register_view(
     rows = model.observations_of(view)
     if len(rows) < max(min_inliers, 3):
         return Registration(None, 0, len(rows))
+    options = replace(options, max_error_px=options.max_error_px * float(model.pixel_scale[view]))
     found = estimate_absolute_pose(
         model.camera_of(view), model.tracks.pixels[rows], model.xyz[model.tracks.point[rows]], options, rng
     )

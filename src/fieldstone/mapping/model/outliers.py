@@ -52,13 +52,14 @@ def drop_outliers(
     """
     result = reprojections(model)
     behind = np.isinf(result.errors)
-    far_off = ~behind & (result.errors > max_error_px)
+    far_off = ~behind & (result.scaled_errors > max_error_px)
     active = model.active.copy()
     active[result.rows[behind | far_off]] = False
     model = replace(model, active=active)
+    limit_px = max_error_px * model.typical_pixel_scale()
     drops = [
         Drop(stage, "behind the camera", int(behind.sum())),
-        Drop(stage, f"reprojection error over {max_error_px:g} px", int(far_off.sum())),
+        Drop(stage, f"reprojection error over {limit_px:g} px", int(far_off.sum())),
     ]
 
     rows = model.used_observations()
@@ -82,7 +83,7 @@ def recall_observations(model: WorkingModel, max_error_px: float) -> WorkingMode
     )
     result = reprojections(model, candidates)
     active = model.active.copy()
-    active[candidates[result.errors <= max_error_px]] = True
+    active[candidates[result.scaled_errors <= max_error_px]] = True
     return replace(model, active=active)
 
 

@@ -121,14 +121,14 @@ def refine_until_stable(
 
 
 def loss_scale(model: WorkingModel) -> float:
-    """Where a Cauchy loss should bend, in working pixels, for the noise of a model's observations.
+    """Where a Cauchy loss should bend, over the pixel scales, for the noise of a model's observations.
 
     It then loses 5 % of the efficiency of least squares if the noise is normal, and wins if its tails are heavier.
 
     Source:
         `holland1977`.
     """
-    errors = reprojections(model).errors
+    errors = reprojections(model).scaled_errors
     sigma = float(np.median(errors)) / MEDIAN_OF_RAYLEIGH if len(errors) else 1.0
     return float(np.clip(CAUCHY_SIGMAS * sigma, *LOSS_SCALES_PX))
 
@@ -184,5 +184,6 @@ def bundle_problem(
         fixed_views=~free[registered],
         fixed_points=np.zeros(len(ids), dtype=bool),
         refine=refine,
+        pixel_scale=model.pixel_scale[registered],
     )
     return problem, registered, ids

@@ -28,10 +28,9 @@ def retriangulate(
     rows, uv = rows[valid], uv[valid]
     point = model.tracks.point[rows]
     ids, starts = np.unique(point, return_index=True)
-    focal = np.array([model.camera_of(v).focal.mean() for v in range(model.num_views)])
     found, inliers = triangulate_robust(
         model.cam_from_world,
-        focal,
+        model.scaled_focals(),
         model.tracks.view[rows],
         uv,
         np.append(starts, len(rows)),

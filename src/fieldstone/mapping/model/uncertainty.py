@@ -31,15 +31,16 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
     problem, registered, _ = bundle_problem(
         model, model.is_point(), model.registered, calibration, options.min_views_for_intrinsics
     )
-    errors = reprojections(model).errors
+    errors = reprojections(model).scaled_errors
     freedoms = 2 * len(errors) - 6 * len(registered) - 3 * len(problem.points) + 7
     freedoms -= int(sum(mask.sum() for mask in problem.refine))
-    sigma_px = float(np.sqrt(np.sum(errors**2) / max(freedoms, 1)))
+    sigma = float(np.sqrt(np.sum(errors**2) / max(freedoms, 1)))
     bundle = replace(options.final, camera_priors=priors(problem.cameras, calibration))
-    found = bundle_covariance(problem, bundle, sigma_px=sigma_px * robust_factor(errors, bundle))
+    found = bundle_covariance(problem, bundle, sigma_px=sigma * robust_factor(errors, bundle))
     of_views = np.full((model.num_views, 6, 6), np.nan)
     of_views[registered] = found.of_views
     rotation = np.rad2deg(np.sqrt(np.trace(of_views[:, :3, :3], axis1=1, axis2=2)))
+    sigma_px = sigma * model.typical_pixel_scale()
     return Uncertainty(of_views, found.of_points, sigma_px, rotation, _of_centers(model, of_views))
 
 

@@ -30,15 +30,27 @@ class WorkingModel:
     tracks: Observations
     xyz: Float[np.ndarray, "t 3"]
     active: Bool[np.ndarray, "o"]
+    pixel_scale: Float[np.ndarray, "v"]
+    """See `MatchGraph`: thresholds are multiplied by it."""
 
     @staticmethod
-    def start(cameras: tuple[Camera, ...], camera_of_view: Int[np.ndarray, "v"], tracks: Observations) -> WorkingModel:
-        """No pose and no point yet."""
+    def start(
+        cameras: tuple[Camera, ...],
+        camera_of_view: Int[np.ndarray, "v"],
+        tracks: Observations,
+        pixel_scale: Float[np.ndarray, "v"] | None = None,
+    ) -> WorkingModel:
+        """No pose and no point yet.
+
+        Args:
+            pixel_scale: None: one everywhere.
+        """
         v = len(camera_of_view)
         no_poses = Rigid3(np.tile(np.eye(3), (v, 1, 1)), np.zeros((v, 3)))
         num_tracks = int(tracks.point[-1]) + 1 if len(tracks) else 0
         xyz, active = np.full((num_tracks, 3), np.nan), np.ones(len(tracks), dtype=bool)
-        return WorkingModel(cameras, camera_of_view, no_poses, np.zeros(v, dtype=bool), tracks, xyz, active)
+        scale = np.ones(v) if pixel_scale is None else pixel_scale
+        return WorkingModel(cameras, camera_of_view, no_poses, np.zeros(v, dtype=bool), tracks, xyz, active, scale)
 
     @property
     def num_views(self) -> int:
@@ -53,6 +65,14 @@ class WorkingModel:
     def camera_of(self, view: int) -> Camera:
         """The camera of a view."""
         return self.cameras[self.camera_of_view[view]]
+
+    def scaled_focals(self) -> Float[np.ndarray, "v"]:
+        """Mean focal length of every view over its pixel scale: an angle times it is an error for thresholds."""
+        return np.array([self.camera_of(v).focal.mean() for v in range(self.num_views)]) / self.pixel_scale
+
+    def typical_pixel_scale(self) -> float:
+        """By what to multiply errors over pixel scales that are told of the whole model: the median of its photos."""
+        return float(np.median(self.pixel_scale[self.registered])) if self.registered.any() else 1.0
 
     def pose_of(self, view: int) -> Rigid3:
         """`cam_from_world` of a registered view."""
@@ -78,7 +98,7 @@ class WorkingModel:
 
     def on_tracks(self, tracks: Observations) -> WorkingModel:
         """The same cameras and poses, without a point yet, on other tracks."""
-        start = WorkingModel.start(self.cameras, self.camera_of_view, tracks)
+        start = WorkingModel.start(self.cameras, self.camera_of_view, tracks, self.pixel_scale)
         return replace(start, cam_from_world=self.cam_from_world, registered=self.registered)
 
     def all_tracks(self) -> Bool[np.ndarray, "t"]:
@@ -116,6 +136,9 @@ class Reprojections:
     rows: Int[np.ndarray, "u"]
     pixels: Float[np.ndarray, "u 2"]
     errors: Float[np.ndarray, "u"]
+    """In pixels of the photos."""
+    scaled_errors: Float[np.ndarray, "u"]
+    """Over the pixel scale of the photo: what thresholds are compared with."""
 
 
 def reprojections(model: WorkingModel, rows: Int[np.ndarray, "u"] | None = None) -> Reprojections:
@@ -129,7 +152,8 @@ def reprojections(model: WorkingModel, rows: Int[np.ndarray, "u"] | None = None)
         mine = model.camera_of_view[view] == c
         pixels[mine] = image_from_cam(camera, in_cam[mine])
     errors = np.linalg.norm(pixels - model.tracks.pixels[rows], axis=1)
-    return Reprojections(rows, pixels, np.nan_to_num(errors, nan=np.inf))
+    errors = np.nan_to_num(errors, nan=np.inf)
+    return Reprojections(rows, pixels, errors, errors / model.pixel_scale[view])
 
 
 def record_views(

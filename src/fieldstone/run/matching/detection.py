@@ -39,6 +39,10 @@ class DetectedPhoto:
     """See `sharpness`."""
     mask: Path | None = None
 
+    def pixel_scale(self, max_image_size: int) -> float:
+        """Pixels of the photo per pixel of the detector at its finest; 1 for a photo that is not reduced."""
+        return max(1.0, max(self.info.width, self.info.height) / max_image_size)
+
     def pixels(self) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
         """The photo, decoded, and which of its pixels are kept; None: all."""
         return read_photo(self.info.path).rgb, None if self.mask is None else read_mask(self.mask, self.info)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from fieldstone.features.matching import MutualRatio
 from fieldstone.features.verification import two_views_of_pairs
@@ -21,17 +21,12 @@ from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 
 def match_pairs(
     photos: Sequence[DetectedPhoto],
-    keypoints: Sequence[Float[np.ndarray, "_ 2"]],
     pairs: Sequence[ImagePair],
     options: MatchingOptions,
     workspace: Workspace,
     on_progress: OnProgress = silent,
 ) -> MatchGraph:
-    """Putative matches of the pairs, in their order; pairs without any are left out.
-
-    Args:
-        keypoints: Of every photo, in working pixels.
-    """
+    """Putative matches of the pairs, in their order; pairs without any are left out."""
     matcher = MutualRatio(options.max_ratio)
     progress = StageProgress(on_progress, "matching", len(pairs))
 
@@ -46,9 +41,10 @@ def match_pairs(
     matches = resumed(workspace, "matches", keys, pairs, work, packing)
     return MatchGraph(
         tuple(photo.info.path.name for photo in photos),
-        tuple(keypoints),
+        tuple(photo.features.keypoints for photo in photos),
         tuple(photo.features.colors for photo in photos),
         {pair: rows for pair, rows in zip(pairs, matches, strict=True) if len(rows)},
+        pixel_scale=np.array([photo.pixel_scale(options.sift.max_image_size) for photo in photos]),
     )
 
 

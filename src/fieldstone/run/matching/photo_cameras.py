@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.features.verification import MAX_VOTING_PAIRS, calibrate_from_pairs
-from fieldstone.geometry.camera import Camera, rescale, turned
+from fieldstone.geometry.camera import Camera, turned
 from fieldstone.io.images.photos import PhotoInfo
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.match_graph import MatchGraph
@@ -155,9 +155,3 @@ def _given_camera(options: MatchingOptions, info: PhotoInfo) -> Camera:
         return turned(Camera(model, int(width), int(height), values), turn)
     except ValueError as error:
         raise InputError(f"--intrinsics {','.join(map(str, options.intrinsics))}: {error}") from error
-
-
-def reduced_camera(camera: Camera, max_image_size: int) -> Camera:
-    """The camera of the photo as reduced for matching."""
-    factor = min(1.0, max_image_size / max(camera.width, camera.height))
-    return rescale(camera, max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))

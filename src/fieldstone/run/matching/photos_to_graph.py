@@ -5,16 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.features.pairs import choose_pairs
-from fieldstone.geometry.camera import Camera, rescale
+from fieldstone.geometry.camera import Camera
 from fieldstone.io.course.matching_txt import read_course_folder
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
@@ -23,9 +23,8 @@ from fieldstone.report.raster import DRAWN_PX
 from fieldstone.run.matching.detection import DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.pairs import match_pairs, verify
-from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, reduced_camera, vote_on_focal
+from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, vote_on_focal
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.scene.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -37,8 +36,7 @@ PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
 class MatchedPhotos:
     """A correspondence graph with cameras, and the photos behind it.
 
-    The graph and the cameras are in working pixels: those of the photos as reduced for matching. `full_size` brings a
-    reconstruction back to the pixels of the photos.
+    Keypoints and cameras are in pixels of the upright photos, whatever size features were detected at.
     """
 
     graph: MatchGraph
@@ -49,25 +47,12 @@ class MatchedPhotos:
     photo_of: PhotoByName
     problems: tuple[PhotoProblem, ...]
     seconds: Mapping[str, float]
-    sizes: tuple[tuple[int, int], ...]
-    """(width, height) of the photo behind each camera."""
     photos: tuple[DetectedPhoto, ...] = ()
     """Photos with their features; none where the matches were given."""
     sharpness: Mapping[str, float] = field(default_factory=dict)
     """Of photos by name, see `detection.sharpness`."""
     notes: Sequence[str] = ()
     """What a user should know of how the cameras were found."""
-
-    def full_size(self, model: Reconstruction) -> Reconstruction:
-        """A reconstruction in working pixels, in the pixels of the photos."""
-        cameras = tuple(rescale(c, *size) for c, size in zip(model.cameras, self.sizes, strict=True))
-        camera_of_view = np.array([view.camera for view in model.views], dtype=np.int64)
-        pixels = model.observations.pixels * self.pixel_factors()[camera_of_view[model.observations.view]]
-        return replace(model, cameras=cameras, observations=replace(model.observations, pixels=pixels))
-
-    def pixel_factors(self) -> Float[np.ndarray, "c 2"]:
-        """Pixels of the photo per working pixel, for each camera and axis."""
-        return np.array([[w / c.width, h / c.height] for c, (w, h) in zip(self.cameras, self.sizes, strict=True)])
 
 
 def read_course(folder: Path) -> MatchedPhotos:
@@ -83,7 +68,6 @@ def read_course(folder: Path) -> MatchedPhotos:
         photo_of=photos_on_disk([path for path in course.photos if path is not None]),
         problems=course.problems,
         seconds={"reading": time.perf_counter() - start},
-        sizes=((camera.width, camera.height),),
     )
 
 
@@ -108,12 +92,6 @@ def match_photos(
     infos, features = [photo.info for photo in photos], [photo.features for photo in photos]
     stop("features")
     cameras, camera_of_image, source = cameras_of_photos(infos, options)
-    sizes = tuple((camera.width, camera.height) for camera in cameras)
-    working = tuple(reduced_camera(camera, options.sift.max_image_size) for camera in cameras)
-    keypoints = [
-        f.keypoints * (np.array([working[c].width, working[c].height]) / sizes[c])
-        for f, c in zip(features, camera_of_image.tolist(), strict=True)
-    ]
     pairs = choose_pairs(
         features,
         options.pairs,
@@ -121,23 +99,22 @@ def match_photos(
         positions=gps_positions(infos),
         threads=options.threads,
     )
-    graph = match_pairs(photos, keypoints, pairs, options, workspace, on_progress)
+    graph = match_pairs(photos, pairs, options, workspace, on_progress)
     stop("matching")
-    working, notes = vote_on_focal(graph, working, camera_of_image, source, options, seed)
-    graph = verify(graph, photos, working, camera_of_image, options, seed, workspace, on_progress)
+    cameras, notes = vote_on_focal(graph, cameras, camera_of_image, source, options, seed)
+    graph = verify(graph, photos, cameras, camera_of_image, options, seed, workspace, on_progress)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])
     sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
     return MatchedPhotos(
         graph,
-        working,
+        cameras,
         camera_of_image,
         known,
         photo_of,
         tuple(problems),
         seconds,
-        sizes,
         tuple(photos),
         sharpness,
         notes,

@@ -73,9 +73,17 @@ class Rematcher:
             two_view = graph.two_views.get(pair)
             if two_view is None or two_view.kind != "calibrated":
                 continue
-            K1, K2 = (unregistered.cameras[self.camera_of_image[v]].calibration_matrix() for v in pair)
+            # Over the pixel scales, so that one threshold serves both photos.
+            scales = graph.scale_of_image[list(pair)]
+            K1, K2 = (
+                np.diag([1 / s, 1 / s, 1.0]) @ unregistered.cameras[self.camera_of_image[v]].calibration_matrix()
+                for v, s in zip(pair, scales, strict=True)
+            )
             F = np.linalg.inv(K2).T @ two_view.matrix @ np.linalg.inv(K1)
-            a, b = (replace(self.photos[v].features, keypoints=graph.keypoints[v]) for v in pair)
+            a, b = (
+                replace(self.photos[v].features, keypoints=graph.keypoints[v] / s)
+                for v, s in zip(pair, scales, strict=True)
+            )
             rows = match_guided_numba(a, b, F, options.two_view.ransac.max_error_px, options.max_ratio)
             if len(rows) > two_view.inliers.sum():
                 chosen.append(pair)
@@ -97,10 +105,9 @@ class Rematcher:
         keypoints, colors = list(graph.keypoints), list(graph.colors)
         photos = unregistered.photos[:MAX_RECOVERED]
         for v in photos:
-            camera, info = unregistered.cameras[self.camera_of_image[v]], self.photos[v].info
             with opencv_threads(self.options.threads):
                 features[v] = richer(*self.photos[v].pixels())
-            keypoints[v] = features[v].keypoints * np.array([camera.width / info.width, camera.height / info.height])
+            keypoints[v] = features[v].keypoints
             colors[v] = features[v].colors
         graph = replace(
             graph,
