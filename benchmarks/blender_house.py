@@ -24,7 +24,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.images.photos import write_photo
 from fieldstone.scene.rays import pixel_centers
 from fieldstone.synthetic.building import build_house
-from fieldstone.synthetic.light import look_at
+from fieldstone.synthetic.light import level_camera
 from fieldstone.synthetic.patches import look, shade
 from fieldstone.synthetic.photos import House, develop, make_house
 
@@ -57,7 +57,7 @@ def main() -> None:
     scale = DISTANCE / arguments.distance
     with ThreadPoolExecutor(os.cpu_count()) as executor:
         for split, positions in {"train": train_positions(seed=5), "test": test_positions()}.items():
-            poses = [look_at(MIDDLE + arguments.distance * p, MIDDLE) for p in positions]
+            poses = [level_camera(MIDDLE + arguments.distance * p, MIDDLE) for p in positions]
 
             def take(k: int, split: str = split, poses: list[Rigid3] = poses) -> dict[str, object]:
                 write_photo(arguments.out / split / f"r_{k}.png", photograph(house, camera, poses[k]))

@@ -11,8 +11,8 @@ from fieldstone.field.grid.layout import grid_layout
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.field.grid_training.plan import GridPlan, Schedule
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.geometry.sim3 import Sim3
-from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.rays import rays_from_view
 
 FRAME = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))

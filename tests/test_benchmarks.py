@@ -7,7 +7,7 @@ from benchmarks.blender_house import blender_matrix, direction
 from benchmarks.field import kernel_times
 
 from fieldstone.field.grid_training.prepare import prepare_grid_training
-from fieldstone.synthetic.light import look_at
+from fieldstone.synthetic.light import level_camera
 from grid_scenes import FRAME, ball_images, plan_of
 
 
@@ -24,7 +24,7 @@ def test_every_kernel_of_a_step_is_timed():
 
 def test_blender_cameras_look_along_minus_z_at_the_origin():
     position = np.array([0.3, -0.2, 3.6]) + 20.0 * direction(0.7, 0.4)
-    matrix = blender_matrix(look_at(position, np.array([0.3, -0.2, 3.6])), 4.0 / 20.0)
+    matrix = blender_matrix(level_camera(position, np.array([0.3, -0.2, 3.6])), 4.0 / 20.0)
     np.testing.assert_allclose(-matrix[:3, 2], -direction(0.7, 0.4), atol=1e-12)
     np.testing.assert_allclose(matrix[:3, 3], 4.0 * direction(0.7, 0.4), atol=1e-12)
     assert matrix[2, 1] > 0

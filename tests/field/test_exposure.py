@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from fieldstone.field.grid.exposure import gain_at, gains_of, step_exposure, unit_exposure
-from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.render.camera_paths import look_at
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 
 
 def test_gains_of_photos_are_found_but_for_the_mean_of_all():

@@ -8,15 +8,14 @@ from fieldstone.field.base.radiance_field import RenderedRays
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
 from fieldstone.field.evidence.pose_refinement import (
     RefinablePhoto,
-    pixels_by_pose,
     refinable_photos,
     refined,
     refined_images,
 )
 from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.geometry.camera import Camera, image_from_cam
-from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.render.camera_paths import look_at
+from fieldstone.geometry.jacobian import image_from_world_jacobian
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.scene.rays import rays_from_view
 from grid_scenes import FRAME, ball_images, plan_of
 
@@ -63,17 +62,6 @@ def errors(true: list[Rigid3], images) -> np.ndarray:
     return np.array([np.linalg.norm(a - b, axis=1).max() for a, b in zip(found, expected, strict=True)])
 
 
-def test_derivatives_are_those_of_central_differences():
-    rng = np.random.default_rng(0)
-    pose = look_at(np.array([3.0, 1.0, 0.5]), np.zeros(3), np.array([0.0, 0, 1]))
-    points = rng.uniform(-0.6, 0.6, size=(20, 3))
-    J = pixels_by_pose(CAMERA, pose, points)
-    for k in range(6):
-        step = 1e-6 * np.eye(6)[k]
-        ahead, behind = (image_from_cam(CAMERA, pose.retract(s).apply(points)) for s in (step, -step))
-        np.testing.assert_allclose(J[:, :, k], (ahead - behind) / 2e-6, rtol=1e-6, atol=1e-5)
-
-
 def test_photos_find_back_to_where_they_were_taken():
     true, images = displaced(4, 0.02)
     before = errors(true, images)
@@ -109,7 +97,7 @@ def test_what_holds_a_photo_is_what_its_points_say():
     seen = {"0": SeenPoints(points, np.full(50, 0.1))}
     held, by_cube = refinable_photos(tuple(images), FRAME, seen)
     # Half a pixel for each of 50 points: a motion that moves them by one pixel each costs 50 * 4 / 2.
-    J = pixels_by_pose(CAMERA, images[0].cam_from_world, points).reshape(100, 6)
+    J = image_from_world_jacobian(CAMERA, images[0].cam_from_world, points).by_pose.reshape(100, 6)
     np.testing.assert_allclose(held.information, 4.0 * J.T @ J, rtol=1e-9)
     assert np.linalg.eigvalsh(by_cube.information).min() > 0
 

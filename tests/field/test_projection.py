@@ -11,9 +11,8 @@ from fieldstone.field.base.projection import (
 from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.base.space import projective_space
 from fieldstone.field.base.space_numba import marched_ray_numba
-from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import exp
-from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.rays import rays_from_view
 from grid_scenes import CAMERA, FRAME
 

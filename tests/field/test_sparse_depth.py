@@ -6,8 +6,7 @@ from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
 from fieldstone.field.base.space import box_space, projective_space
 from fieldstone.field.evidence.sparse_depth import seen_points, sparse_depth_rays
 from fieldstone.geometry.camera import Camera, image_from_cam
-from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.render.camera_paths import look_at
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
 from grid_scenes import CAMERA, FRAME, RADIUS, ball_images

@@ -9,8 +9,8 @@ from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import PosedImage, training_rays
 from fieldstone.field.base.training import NERF, PRESETS, TINY, TrainOptions, train
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.geometry.sim3 import Sim3
-from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.rays import Rays, rays_from_view
 
 torch = pytest.importorskip("torch")

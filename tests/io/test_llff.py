@@ -7,9 +7,9 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import image_from_cam
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.posed.llff import is_llff_folder, read_llff
-from fieldstone.render.camera_paths import look_at
 from real_data import data_folder
 
 POINT = np.array([0.1, 0.2, 4.0])

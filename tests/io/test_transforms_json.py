@@ -12,10 +12,10 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import image_from_cam
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.posed.transforms_json import find_transforms, read_transforms
 from fieldstone.io.shapes.ply import write_points
-from fieldstone.render.camera_paths import look_at
 from fieldstone.scene.reconstruction import Points
 from mutations import check_mutations
 

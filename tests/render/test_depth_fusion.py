@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.render.camera_paths import look_at
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.render.depth_fusion import REACH, fused
 from fieldstone.render.meshing import cleaned
 from fieldstone.scene.rays import rays_from_view

@@ -5,7 +5,7 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
-from fieldstone.render.camera_paths import look_at
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.render.meshing import cleaned, colored, solidity, surface
 from fieldstone.render.rasterize_numba import mesh_depth
 from fieldstone.scene.mesh import Mesh

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import random_rotation
-from fieldstone.render.camera_paths import look_at
 from fieldstone.render.meshing import surface
 from fieldstone.render.splat_view_numba import DILATION, splat_view
 from fieldstone.render.splatting import splats_of_surface

@@ -11,6 +11,7 @@ from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
 from fieldstone.geometry.sim3 import Sim3
+from fieldstone.geometry.triangulation import in_front_of_both
 from fieldstone.mapping.textbook import TextbookOptions, map_textbook
 from fieldstone.report.model_figures import (
     NAME_SIZE,
@@ -18,7 +19,6 @@ from fieldstone.report.model_figures import (
     four_poses_figure,
     from_above_figure,
     frustum_edges,
-    in_front_of_both,
     perspective_figure,
     similarity_between,
     upright_frame,

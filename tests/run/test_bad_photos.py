@@ -26,7 +26,7 @@ from fieldstone.run.reconstruct import reconstruct
 from fieldstone.run.reconstruct_options import ReconstructOptions, Tuning
 from fieldstone.synthetic import materials
 from fieldstone.synthetic.construction import Builder
-from fieldstone.synthetic.light import Sky, look_at
+from fieldstone.synthetic.light import Sky, level_camera
 from fieldstone.synthetic.patches import Texture
 from fieldstone.synthetic.photos import House, PhotoOptions, photograph
 
@@ -190,7 +190,9 @@ def other_photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wall")
     wall = a_wall()
     poses = [
-        look_at(np.array([1.2 * (k - 2.5), -9.0 + 0.5 * (k % 2), 3.0 + 0.4 * (k % 3)]), np.array([0.2 * k - 0.5, 0, 3]))
+        level_camera(
+            np.array([1.2 * (k - 2.5), -9.0 + 0.5 * (k % 2), 3.0 + 0.4 * (k % 3)]), np.array([0.2 * k - 0.5, 0, 3])
+        )
         for k in range(5)
     ]
     shoot(wall, poses, folder, "wall")
@@ -243,7 +245,9 @@ def test_photos_of_different_places_are_no_model(house_photos, other_photos, tmp
 
 def test_a_camera_that_only_turns_is_told_so(tmp_path):
     (tmp_path / "turn").mkdir()
-    poses = [look_at(np.array([0.0, -9.0, 3.0]), np.array([1.3 * k - 2.0, 0.0, 3.0 + 0.3 * (k % 2)])) for k in range(4)]
+    poses = [
+        level_camera(np.array([0.0, -9.0, 3.0]), np.array([1.3 * k - 2.0, 0.0, 3.0 + 0.3 * (k % 2)])) for k in range(4)
+    ]
     shoot(a_wall(), poses, tmp_path / "turn", "turn")
     _, verdicts = verdicts_of(tmp_path / "turn", tmp_path, 4)
     assert all("only turned" in verdict for verdict in verdicts.values())

@@ -7,9 +7,9 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.shapes.ply import write_points
-from fieldstone.render.camera_paths import look_at
 from fieldstone.run.field_input import open_field_input, read_ray_dataset
 from fieldstone.scene.reconstruction import Points
 from grid_scenes import ball_images

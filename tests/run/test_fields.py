@@ -11,10 +11,10 @@ from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr, ssim
 from fieldstone.field.base.training import PRESETS, TINY
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
-from fieldstone.render.camera_paths import look_at
 from fieldstone.run.field_input import read_ray_dataset, view_labels
 from fieldstone.run.fields import train_run
 from fieldstone.run.render import render_run

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.synthetic.light import look_at, shadow_map
+from fieldstone.synthetic.light import level_camera, shadow_map
 from fieldstone.synthetic.noise import cells, fractal
 from fieldstone.synthetic.patches import NEAR, Patch, Texture, look, shade
 
@@ -47,7 +47,7 @@ def by_intersection(patches: list[Patch], cam_from_world: Rigid3, x: float, y: f
 def test_every_ray_meets_the_patch_that_intersection_finds(inside):
     rng = np.random.default_rng(3)
     patches = [random_patch(rng, k % 4) for k in range(24)]
-    pose = look_at(np.array([0.3, 0.1, -0.2]) if inside else np.array([5.0, -3.0, 2.0]), np.zeros(3), roll=0.3)
+    pose = level_camera(np.array([0.3, 0.1, -0.2]) if inside else np.array([5.0, -3.0, 2.0]), np.zeros(3), roll=0.3)
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 31), np.linspace(-0.5, 0.5, 23))
     seen = look(patches, pose, x, y)
     expected = [by_intersection(patches, pose, u, v) for u, v in zip(x.ravel(), y.ravel(), strict=True)]
@@ -71,7 +71,7 @@ def test_shading_puts_the_texture_where_the_patch_is():
     patch = Patch(np.array([-1.0, 2.0, -1.0]), np.eye(3)[0], np.eye(3)[2], 2.0, 2.0, np.empty((0, 3)), np.empty((0, 4)))
     a, b = np.meshgrid((np.arange(200) + 0.5) / 100, (np.arange(200) + 0.5) / 100)
     texture = Texture.build(np.stack([a, b, np.ones_like(a)], axis=-1), 0.01)
-    pose = look_at(np.array([0.4, -1.0, 0.3]), np.array([0.0, 2.0, 0.1]))
+    pose = level_camera(np.array([0.4, -1.0, 0.3]), np.array([0.0, 2.0, 0.1]))
     x, y = np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.2, 0.2, 7))
     seen = look([patch], pose, x, y)
     assert np.all(seen.patch == 0)

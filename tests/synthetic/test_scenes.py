@@ -9,7 +9,6 @@ import pytest
 
 from fieldstone.geometry.camera import Camera, bearings_from_image
 from fieldstone.geometry.epipolar import sampson_error
-from fieldstone.geometry.rigid3 import look_at
 from fieldstone.geometry.triangulation import depths
 from fieldstone.scene.tracks import build_tracks
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
@@ -155,16 +154,3 @@ def test_same_seed_same_scene():
 def test_wrong_options_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         SceneOptions(**wrong)
-
-
-def test_look_at_puts_the_target_on_the_axis_and_up_above():
-    center, target, up = np.array([1.0, 2.0, 3.0]), np.array([-2.0, 0.5, 1.0]), np.array([0.0, 0.0, 1.0])
-    pose = look_at(center, target, up)
-    np.testing.assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(pose.R) > 0
-    np.testing.assert_allclose(pose.apply(target), [0, 0, float(np.linalg.norm(target - center))], atol=1e-12)
-    above = pose.apply(target + 0.1 * up)
-    assert above[1] < 0
-    assert abs(above[0]) < 1e-12
-    with pytest.raises(ValueError, match="no view"):
-        look_at(center, center + up, up)

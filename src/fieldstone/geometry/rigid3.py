@@ -71,13 +71,15 @@ def look_at(center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: 
     """`cam_from_world` of a camera at `center` that looks at `target`, with `up` pointing up in its image.
 
     Raises:
-        ValueError: Centre and target are the same, or the view is along `up`.
+        ValueError: The target is the centre, or straight up or down from it.
     """
-    forward = target - center
+    distance = np.linalg.norm(target - center)
+    forward = (target - center) / (distance if distance > 0 else 1.0)
     right = np.cross(forward, up)
-    if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(up):
-        raise ValueError(f"no view from {center.tolist()} to {target.tolist()} with up {up.tolist()}")
-    forward = forward / np.linalg.norm(forward)
-    right = right / np.linalg.norm(right)
+    length = np.linalg.norm(right)
+    if not length > 1e-9 * np.linalg.norm(up):
+        sight = f"from {center.tolist()} to {target.tolist()}"
+        raise ValueError(f"a camera that looks {sight} has no upright position for up = {up.tolist()}")
+    right = right / length
     R = np.stack([right, np.cross(forward, right), forward])
     return Rigid3(R, -R @ center)

@@ -126,7 +126,7 @@ def nearest_rotation(M: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 
     """The rotation (det = +1) nearest to M in the Frobenius norm: U diag(1, 1, det(U V^T)) V^T.
 
     Source:
-        `hartley2004`, section A4.; `umeyama1991`, eq. 39 for the sign.
+        `umeyama1991`, the lemma with A = M and B = I.
     """
     U, _, Vt = np.linalg.svd(M)
     d = np.ones((*M.shape[:-2], 3))

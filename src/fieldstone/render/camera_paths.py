@@ -6,25 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fieldstone.geometry import rotation
-from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 
 FULL_CIRCLE_GAP_DEG = 120.0
 """Photos with no gap wider than this around the scene surround it: the path is a full circle, else an arc."""
-
-
-def look_at(center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Rigid3:
-    """`cam_from_world` of a camera at `center` that looks at `target`, `up` upwards in the image.
-
-    Raises:
-        ValueError: The target is the centre, or straight up or down from it.
-    """
-    forward = _unit(target - center)
-    right = np.cross(forward, up)
-    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"a camera at {center} that looks at {target} has no upright position for up = {up}")
-    right = _unit(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    return Rigid3(R, -R @ center)
 
 
 def focus_point(cam_from_world: Rigid3) -> Float[np.ndarray, "3"]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import angle_between, nearest_rotation
 from fieldstone.geometry.sim3 import Sim3
+from fieldstone.geometry.triangulation import in_front_of_both
 from fieldstone.report import raster, svg
 from fieldstone.report.panel import Panel, axes, ticks, title
 from fieldstone.report.theme import LIGHT, LIGHTBOX, Theme, evenly, label, mixed, readable_colors, rgb_of
@@ -67,11 +68,6 @@ def four_poses_figure(initial: InitialPair, names: tuple[str, str], *, theme: Th
         if is_chosen:
             parts.append(svg.rectangle(panel.box, "none", "chosen", outline=theme.good, width=2.6))
     return svg.page(width, height, theme, parts)
-
-
-def in_front_of_both(cam2_from_cam1: Rigid3, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Which points (first camera's frame) lie in front of both cameras."""
-    return (points[:, 2] > 0) & (cam2_from_cam1.apply(points)[:, 2] > 0)
 
 
 def from_above_figure(model: Reconstruction, *, theme: Theme = LIGHTBOX) -> str:

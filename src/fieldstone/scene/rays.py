@@ -33,14 +33,6 @@ def pixel_centers(width: int, height: int) -> Float[np.ndarray, "n 2"]:
     return np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
 
 
-def rays_from_pixels(camera: Camera, cam_from_world: Rigid3, pixels: Float[np.ndarray, "r 2"]) -> Rays:
-    """One ray through each pixel position (corner convention; distortion undone exactly).
-
-    Pixels at which the distortion has no inverse give nan directions.
-    """
-    return _rays_along(bearings_from_image(camera, pixels), camera, cam_from_world)
-
-
 def _rays_along(bearings: Float[np.ndarray, "r 3"], camera: Camera, cam_from_world: Rigid3) -> Rays:
     directions = bearings @ cam_from_world.R
     origin = cam_from_world.target_origin_in_source()

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.synthetic.materials import linear
 from fieldstone.synthetic.noise import fractal, smoothstep
 from fieldstone.synthetic.patches import Patch, Texture, look
@@ -57,18 +57,19 @@ def shadow_map(
     patches: Sequence[Patch], direction: Float[np.ndarray, "3"], texel: float, center: Float[np.ndarray, "3"]
 ) -> ShadowMap:
     """The shadow map of a direction for everything within `MAP_RADIUS` of a centre."""
-    pose = look_at(center + DISTANCE * direction, center)
+    pose = level_camera(center + DISTANCE * direction, center)
     count = int(2 * MAP_RADIUS / texel)
     line = (np.arange(count) + 0.5 - count / 2) * (texel / DISTANCE)
     return ShadowMap(direction, pose, look(patches, pose, *np.meshgrid(line, line)).depth, texel)
 
 
-def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], roll: float = 0.0) -> Rigid3:
-    """cam_from_world of a camera at `position` that looks at `target`, its x axis level but for `roll` (radians)."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    down = np.cross(forward, right)
+def level_camera(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], roll: float = 0.0) -> Rigid3:
+    """cam_from_world of a camera at `position` that looks at `target`, its x axis level but for `roll` (radians).
+
+    Raises:
+        ValueError: The target is straight above or below.
+    """
+    right, down, forward = look_at(position, target, np.array([0.0, 0.0, 1.0])).R
     turned_right = np.cos(roll) * right + np.sin(roll) * down
     turned_down = np.cos(roll) * down - np.sin(roll) * right
     R = np.stack([turned_right, turned_down, forward])

@@ -26,7 +26,7 @@ from fieldstone.scene.tracks import Observations
 from fieldstone.synthetic import materials
 from fieldstone.synthetic.building import NUM_LEAVES, build_house
 from fieldstone.synthetic.construction import Surface
-from fieldstone.synthetic.light import Lighting, Sky, look_at
+from fieldstone.synthetic.light import Lighting, Sky, level_camera
 from fieldstone.synthetic.patches import Patch, Seen, Texture, look, shade
 
 TRUTH_FILE = "truth.json"
@@ -159,7 +159,7 @@ def camera_arc(options: PhotoOptions, rng: np.random.Generator) -> list[Rigid3]:
         height = 3.1 + 1.7 * np.sin(1.3 * k + 0.5)
         position = np.array([0.5 + distance * np.sin(azimuth), -0.2 - distance * np.cos(azimuth), height])
         target = HOUSE_CENTER + rng.uniform(-0.35, 0.35, size=3) + [0.0, 0.0, 0.45]
-        poses.append(look_at(position, target, roll=float(rng.normal(0.0, 0.015))))
+        poses.append(level_camera(position, target, roll=float(rng.normal(0.0, 0.015))))
     return poses
 
 

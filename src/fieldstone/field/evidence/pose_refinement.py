@@ -19,9 +19,9 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, surface_depth
 from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, reduce_images
-from fieldstone.geometry.camera import Camera, image_from_cam_jacobian
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.jacobian import image_from_world_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.geometry.rotation import skew
 from fieldstone.scene.rays import Rays, rays_from_view
 
 SIZE_PX = 112
@@ -70,19 +70,10 @@ def refinable_photos(
         points, sigma_px = middle, UNKNOWN_SIGMA_PX
         if known is not None and len(known.xyz) >= MIN_POINTS:
             points, sigma_px = known.xyz, SIGMA_PX
-        J = pixels_by_pose(image.camera, image.cam_from_world, points)
+        J = image_from_world_jacobian(image.camera, image.cam_from_world, points).by_pose
         J = J[np.isfinite(J).all(axis=(1, 2))]
         out.append(RefinablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
     return tuple(out)
-
-
-def pixels_by_pose(
-    camera: Camera, cam_from_world: Rigid3, points_in_world: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 2 6"]:
-    """Derivatives of the pixels of points by the tangent (omega, v) of `Rigid3.retract`; nan behind the camera."""
-    _, J_point, _ = image_from_cam_jacobian(camera, cam_from_world.apply(points_in_world))
-    J_world = J_point @ cam_from_world.R
-    return np.concatenate([-J_world @ skew(points_in_world), J_world], axis=2)
 
 
 def refined(
@@ -194,7 +185,7 @@ def _step(photo: RefinablePhoto, tangent: np.ndarray, here: _Comparison) -> np.n
         return None
     by_x, by_y = (np.asarray(np.gradient(grid, axis=axis)).reshape(-1, 3) for axis in (1, 0))
     slopes = np.stack([by_x, by_y], axis=2)[here.usable]
-    flow = pixels_by_pose(camera, here.pose, here.points[here.usable])
+    flow = image_from_world_jacobian(camera, here.pose, here.points[here.usable]).by_pose
     # photo(x) - shown(x - flow step) = residual + slope . flow step
     G = np.einsum("pck,pki->pci", slopes, flow).reshape(-1, 6)
     r = here.residual[here.usable].reshape(-1)

@@ -18,10 +18,11 @@ from jaxtyping import Float
 from fieldstone.errors import InputError
 from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.opengl import CV_FROM_GL
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.solve.bundle.problem import BundleProblem
 
-CAM_FROM_BAL_CAM = np.diag([1.0, -1.0, -1.0])
+CAM_FROM_BAL_CAM = CV_FROM_GL
 IMAGE_FROM_BAL_IMAGE = np.array([1.0, -1.0])
 PARAMS_PER_CAMERA = 9
 MAX_ANGLE = 1e3

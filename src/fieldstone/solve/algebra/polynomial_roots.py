@@ -10,7 +10,6 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-MAX_DEGREE = 16
 MAX_ROOT_STEPS = 60
 NEGLIGIBLE = 1e-14
 

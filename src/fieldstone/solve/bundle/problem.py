@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fieldstone.geometry.camera import Camera, image_from_cam, image_from_cam_jacobian
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.jacobian import image_from_world_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.geometry.rotation import skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,27 +86,19 @@ def reprojection_residuals(problem: BundleProblem) -> Float[np.ndarray, "o 2"]:
 
 
 def reprojection_jacobian(problem: BundleProblem) -> tuple[Float[np.ndarray, "o 2"], BundleJacobian]:
-    """Residuals and their derivatives at the current values.
-
-    With x = R X + t and the right update (R exp(omega), t + R v): dx/domega = -R [X]_x, dx/dv = R, dx/dX = R; all
-    divided by the view's scale.
-    """
-    pose = problem.cam_from_world[problem.view]
-    X = problem.points[problem.point]
-    in_cam = pose.apply(X)
-    count = len(problem.view)
+    """Residuals and their derivatives at the current values, all divided by the view's scale."""
+    pose, X, count = problem.cam_from_world[problem.view], problem.points[problem.point], len(problem.view)
     longest = max((len(camera.params) for camera in problem.cameras), default=0)
     residuals = np.empty((count, 2))
-    by_cam_point = np.empty((count, 2, 3))
+    by_pose, by_point = np.empty((count, 2, 6)), np.empty((count, 2, 3))
     by_camera = np.zeros((count, 2, longest))
     for rows, camera in _rows_by_camera(problem):
-        pixels, by_cam_point[rows], J_params = image_from_cam_jacobian(camera, in_cam[rows])
-        by_camera[rows, :, : len(camera.params)] = J_params
-        residuals[rows] = pixels - problem.pixels[rows]
+        J = image_from_world_jacobian(camera, pose[rows], X[rows])
+        by_pose[rows], by_point[rows] = J.by_pose, J.by_point
+        by_camera[rows, :, : len(camera.params)] = J.by_params
+        residuals[rows] = J.pixels - problem.pixels[rows]
     scale = problem.scale_of_view[problem.view, None, None]
-    by_point = by_cam_point @ pose.R / scale
-    by_pose = np.concatenate([-by_point @ skew(X), by_point], axis=2)
-    return residuals / scale[:, 0], BundleJacobian(by_pose, by_point, by_camera / scale)
+    return residuals / scale[:, 0], BundleJacobian(by_pose / scale, by_point / scale, by_camera / scale)
 
 
 def updated(

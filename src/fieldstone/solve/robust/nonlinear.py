@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fieldstone.geometry.camera import Camera, image_from_cam, image_from_cam_jacobian
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.jacobian import image_from_world_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.geometry.rotation import exp, right_jacobian, skew
+from fieldstone.geometry.rotation import exp, right_jacobian
 from fieldstone.solve.robust.loss import RobustLoss, robustify, trivial
 
 
@@ -91,10 +92,10 @@ def pnp_nonlinear(
 
     def jacobian(tangent: np.ndarray) -> np.ndarray:
         pose = cam_from_world.retract(tangent)
-        reprojected, by_cam_point, _ = image_from_cam_jacobian(camera, pose.apply(X))
-        by_omega = -(by_cam_point @ pose.R) @ skew(X) @ right_jacobian(tangent[:3])
-        by_v = by_cam_point @ pose.R @ exp(tangent[:3]).T
-        chain = robustify(loss, reprojected - observed)[1]
+        J = image_from_world_jacobian(camera, pose, X)
+        by_omega = J.by_pose[:, :, :3] @ right_jacobian(tangent[:3])
+        by_v = J.by_pose[:, :, 3:] @ exp(tangent[:3]).T
+        chain = robustify(loss, J.pixels - observed)[1]
         return (chain @ np.concatenate([by_omega, by_v], axis=2)).reshape(-1, 6)
 
     solution = least_squares(residuals, np.zeros(6), jac=jacobian, method="trf", x_scale="jac", ftol=1e-12)  # pyright: ignore[reportArgumentType]
@@ -134,12 +135,11 @@ def _normal_equations(
 ) -> tuple[Float[np.ndarray, "p 3 3"], Float[np.ndarray, "p 3"]]:
     """Sum of w J^T J and w J^T r over the observations of each point, w the robust weight."""
     pose = cam_from_world[view]
-    in_cam = pose.apply(X[point])
     residuals, J = np.empty((len(view), 2)), np.empty((len(view), 2, 3))
     for rows, camera in _rows_by_camera(cameras, camera_of_view, view):
-        reprojected, by_cam_point, _ = image_from_cam_jacobian(camera, in_cam[rows])
-        residuals[rows] = reprojected - pixels[rows]
-        J[rows] = by_cam_point @ pose.R[rows]
+        image = image_from_world_jacobian(camera, pose[rows], X[point[rows]])
+        residuals[rows] = image.pixels - pixels[rows]
+        J[rows] = image.by_point
     weight = loss(np.sum(residuals**2, axis=1))[1]
     A, g = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3))
     np.add.at(A, point, weight[:, None, None] * (np.swapaxes(J, 1, 2) @ J))
