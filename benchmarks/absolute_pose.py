@@ -1,6 +1,6 @@
 """Absolute pose from generated correspondences with outliers: ours against PoseLib and OpenCV, interleaved.
 
-    python -m benchmarks.absolute_pose [--points 1000] [--noise-px 0.5] [--draws 100]
+    python -m benchmarks.absolute_pose [--points 1000] [--noise-px 0.5] [--draws 100] [--out ROWS.json]
 
 Median and 95th percentile of the rotation error and of the position error (relative to the depth of the scene), the
 share of draws that fail (over 1 degree), and CPU milliseconds of one thread.
@@ -12,10 +12,12 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 
+from benchmarks.rows import TIMES, Row, add_out_option, write_rows
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between, exp, random_rotation
@@ -35,7 +37,9 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=1000)
     parser.add_argument("--noise-px", type=float, default=0.5)
     parser.add_argument("--draws", type=int, default=100)
+    add_out_option(parser, "absolute_pose")
     arguments = parser.parse_args()
+    measured: list[Row] = []
     cv2.setNumThreads(1)
     methods = available_methods()
     header = f"{'method':24s} {'rot mdeg':>9s} {'95 %':>9s} {'pos 1e-6':>9s} {'95 %':>9s} {'failed':>7s}"
@@ -58,6 +62,23 @@ def main() -> None:
                 f"{1e6 * np.median(position):9.1f} {1e6 * np.quantile(position, 0.95):9.1f} "
                 f"{np.mean(rotation > 1):7.0%} {ms.mean():8.2f} {np.median(ms):8.2f}\n"
             )
+        measured += rows_of(outliers, {name: np.array(values) for name, values in rows.items()})
+    write_rows(measured, arguments.out)
+
+
+def rows_of(outliers: float, draws: dict[str, np.ndarray]) -> list[Row]:
+    """Errors and CPU time (n 3: degrees, share of the depth, milliseconds), against PoseLib or else OpenCV."""
+    peer = "PoseLib" if "PoseLib" in draws else "OpenCV USAC"
+
+    def row(metric: str, unit: str, number: Callable[[np.ndarray], Any]) -> Row:
+        name = f"absolute_pose/{outliers:.0%} outliers/{metric}"
+        return Row(name, float(number(draws["fieldstone"])), unit, "lower", TIMES, peer, float(number(draws[peer])))
+
+    return [
+        row("rotation median", "mdeg", lambda values: 1e3 * np.median(values[:, 0])),
+        row("failed", "share", lambda values: np.mean(values[:, 0] > 1)),
+        row("cpu mean", "ms", lambda values: np.mean(values[:, 2])),
+    ]
 
 
 def draw(n: int, noise_px: float, outliers: float, rng: np.random.Generator) -> tuple[Rigid3, np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Bundle adjustment, ours against Ceres (through pycolmap) and scipy, interleaved: seconds and final costs.
 
-    python -m benchmarks.bundle [NAME or FILE.txt ...] [--threads 1] [--runs 3] [--scipy]
+    python -m benchmarks.bundle [NAME or FILE.txt ...] [--threads 1] [--runs 3] [--scipy] [--out ROWS.json]
 
 Names: ring50, ring200, short200 (the first two cameras almost in one place), ring1000 (1 M observations), crowd1000
 (any view may see any point), own200 (every view its own camera); files are BAL problems. Ceres is run with its gauge
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bundle_problems import RingOptions, ring_problem
+from benchmarks.rows import QUALITY, TIMES, Row, add_out_option, write_rows
 from fieldstone.io.models.bal import read_bal
 from fieldstone.solve.bundle.adjustment import BundleOptions, bundle_adjust
 from fieldstone.solve.bundle.problem import BundleProblem
@@ -57,7 +58,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--scipy", action="store_true", help="scipy as well: minutes on the larger problems")
     parser.add_argument("--no-ceres", action="store_true")
+    add_out_option(parser, "bundle")
     arguments = parser.parse_args()
+    rows: list[Row] = []
     bundle_adjust(ring_problem(RingOptions(4, 50, reach=2), np.random.default_rng(0)))  # compile first
     for name in arguments.problems:
         problem = load(name)
@@ -72,6 +75,8 @@ def main() -> None:
             for solver, run in solvers.items():
                 runs[solver].append(run(problem))
         report(name, problem, runs)
+        rows += rows_of(Path(name).stem, runs)
+    write_rows(rows, arguments.out)
 
 
 def load(name: str) -> BundleProblem:
@@ -166,6 +171,22 @@ def report(name: str, problem: BundleProblem, runs: dict[str, list[Run]]) -> Non
                 f"CPU {cpu['fieldstone'] / min(cpu[s] for s in peers):.3f}, cost {100 * (ours / best - 1):+.5f} %\n"
             )
     sys.stdout.flush()
+
+
+def rows_of(name: str, runs: dict[str, list[Run]]) -> list[Row]:
+    """Median seconds and final cost, against the Ceres that is best at each, and the scipy where there is no Ceres."""
+    peers = [s for s in runs if s.startswith("ceres")] or [s for s in runs if s == "scipy"]
+    peer = peers[0].partition(",")[0] if peers else None
+
+    def row(metric: str, unit: str, number: Callable[[Run], float], tolerance: float = TIMES) -> Row:
+        ours, *others = (median(map(number, runs[solver])) for solver in ["fieldstone", *peers])
+        return Row(f"bundle/{name}/{metric}", ours, unit, "lower", tolerance, peer, min(others, default=None))
+
+    return [
+        row("wall", "s", lambda run: run.wall_s),
+        row("cpu", "s", lambda run: run.cpu_s),
+        row("cost", "px^2", lambda run: run.cost, QUALITY),
+    ]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The grid field: quality against seconds, and nanoseconds of every kernel of a training step.
 
-    python -m benchmarks.field SCENE --budgets 10,60 [--no-alpha] [--threads 2] [--out FOLDER]
+    python -m benchmarks.field [SCENE] [--budgets 10,60] [--no-alpha] [--threads 2] [--folder FOLDER] [--out ROWS.json]
 
 SCENE is any source of `fieldstone train`. Quality is PSNR on the held-out views, by the protocol in metrics.json; on a
 busy machine compare CPU seconds and steps rather than seconds. Kernels are timed on one thread, on the rays that the
@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.data import DATA, present
+from benchmarks.rows import QUALITY, Row, add_out_option, write_rows
 from fieldstone.field.grid.composite_numba import composite_backward
 from fieldstone.field.grid.decoder import HIDDEN
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
@@ -42,13 +44,17 @@ REPEATS = 30
 def main() -> None:
     """Train for each budget, then time the kernels on the last field."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("scene", type=Path, nargs="?", default=DATA / "lego_100")
     parser.add_argument("--budgets", default="10,60")
     parser.add_argument("--no-alpha", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--folder", type=Path, help="where the fields are left")
+    add_out_option(parser, "field")
     arguments = parser.parse_args()
-    folder = arguments.out or Path(tempfile.mkdtemp())
+    if not present([arguments.scene]):
+        return
+    rows: list[Row] = []
+    folder = arguments.folder or Path(tempfile.mkdtemp())
     out = folder
     for budget in map(float, arguments.budgets.split(",")):
         out = folder / f"{budget:g}s"
@@ -61,11 +67,19 @@ def main() -> None:
             f"{metrics['steps']} steps, finest {metrics['plan']['finest']}, CPU {time.process_time() - cpu:.0f} s with "
             "compiling and rendering"
         )
-    profile(arguments.scene, out, use_alpha=not arguments.no_alpha)
+        name = f"field/{arguments.scene.name}{'/no alpha' if arguments.no_alpha else ''}/{budget:g} s"
+        rows += [
+            Row(f"{name}/psnr", metrics["psnr"], "dB", "higher", QUALITY),
+            Row(f"{name}/ssim", metrics["ssim"], "1", "higher", QUALITY),
+            Row(f"{name}/steps", metrics["steps"], "steps", "higher"),
+        ]
+    kernels = profile(arguments.scene, out, use_alpha=not arguments.no_alpha)
+    rows += [Row(f"field/kernels/{kernel}", ns, "ns", "lower") for kernel, ns in kernels]
+    write_rows(rows, arguments.out)
 
 
-def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
-    """Time the kernels on the field of a run."""
+def profile(scene: Path, out: Path, *, use_alpha: bool) -> list[tuple[str, float]]:
+    """Nanoseconds of each kernel per sample that weighs, on the field of a run."""
     tensors, _ = read_checkpoint(out / "checkpoint.safetensors")
     _, state_tensors = split_tensors(tensors)
     plan = plan_from_json(state_tensors["plan"].tobytes().decode())
@@ -87,6 +101,7 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> None:
     for name, nanoseconds in rows:
         show(f"  {name:28s} {nanoseconds:7.1f} ns")
     show(f"  {'all':28s} {sum(ns for _, ns in rows):7.1f} ns")
+    return rows
 
 
 def kernel_times(training: GridTraining, state: GridState) -> tuple[list[tuple[str, float]], str]:

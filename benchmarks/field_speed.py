@@ -1,6 +1,6 @@
 """How fast fields are shown and learned: frames per second by size, and seconds until a training PSNR by field.
 
-    python -m benchmarks.field_speed SCENE OUT [--sizes 100,200,400,800] [--threads 2]
+    python -m benchmarks.field_speed SCENE OUT [--sizes 100,200,400,800] [--threads 2] [--out ROWS.json]
     python -m benchmarks.field_speed SCENE OUT --networks 120 [--target-db 25]
 
 SCENE is any source of `fieldstone train`, OUT a folder that it trained a fast field in (with `curve.json`). Frames are
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row, add_out_option, write_rows
 from fieldstone.field.base.radiance_field import in_world
 from fieldstone.field.base.training import PRESETS, train
 from fieldstone.field.grid.field import field_from_tensors
@@ -40,21 +41,29 @@ def main() -> None:
     """Frames per second, then, if asked for, the networks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("out", type=Path)
+    parser.add_argument("trained", type=Path, metavar="OUT")
     parser.add_argument("--sizes", default="100,200,400,800")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--networks", type=float, default=0.0)
     parser.add_argument("--target-db", type=float, default=25.0)
+    add_out_option(parser, "field_speed")
     arguments = parser.parse_args()
+    rows: list[Row] = []
     for size in map(int, arguments.sizes.split(",")):
-        wall, cpu, first = frame_seconds(arguments.out, size, arguments.threads)
+        wall, cpu, first = frame_seconds(arguments.trained, size, arguments.threads)
+        rows += [
+            Row(f"field_speed/{size} px/frame wall", 1e3 * wall, "ms", "lower"),
+            Row(f"field_speed/{size} px/frame cpu", 1e3 * cpu, "ms", "lower"),
+            Row(f"field_speed/{size} px/first shown", 1e3 * first, "ms", "lower"),
+        ]
         show(
             f"{size:5d} px: {1 / wall:6.1f} frames/s ({1e3 * cpu:6.1f} ms of CPU a frame), "
             f"something to see after {1e3 * first:.1f} ms"
         )
+    write_rows(rows, arguments.out)
     if arguments.networks <= 0:
         return
-    curve = json.loads((arguments.out / "curve.json").read_text())
+    curve = json.loads((arguments.trained / "curve.json").read_text())
     report("fast", [p["seconds"] for p in curve], [p["psnr"] for p in curve], arguments.target_db)
     for name in ("tiny", "nerf"):
         seconds, psnr = network_curve(arguments.scene, name, arguments.networks, arguments.threads)

@@ -1,7 +1,7 @@
 """Exact matching of two photos: ours against a float product with scans, and OpenCV.
 
-`python -m benchmarks.matching PHOTO_A PHOTO_B` prints CPU seconds (best and median), matches, and how many of them
-are the reference's. One thread, descriptors in memory; the median of the runs is the figure to quote.
+`python -m benchmarks.matching [PHOTO_A PHOTO_B] [--out ROWS.json]` prints CPU seconds (best and median), matches, and
+how many of them are the reference's. One thread, descriptors in memory; the median of the runs is the figure to quote.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,48 +19,75 @@ import numpy as np
 from PIL import Image
 from threadpoolctl import threadpool_limits
 
+from benchmarks.data import DATA, present
+from benchmarks.rows import QUALITY, TIMES, Row, add_out_option, write_rows
 from fieldstone.features.matching import mutual_and_distinct
 from fieldstone.features.nearest import two_nearest
 from fieldstone.features.nearest_numba import two_nearest_numba
 from fieldstone.features.sift import Sift, SiftOptions
 
 MAX_RATIO = 0.8
+DEFAULT_PHOTOS = [DATA / "strecha_fountain_p11" / "images" / f"000{k}.jpg" for k in (4, 5)]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """CPU seconds of each run, and the matches (pairs of rows)."""
+
+    seconds: list[float]
+    matches: set[tuple[int, int]]
 
 
 def main() -> None:
     """Measure and print one line for each implementation."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("photos", type=Path, nargs=2)
+    parser.add_argument("photos", type=Path, nargs="*", default=DEFAULT_PHOTOS, help="two photos")
     parser.add_argument("--features", type=int, default=8192)
     parser.add_argument("--runs", type=int, default=7)
+    add_out_option(parser, "matching")
     options = parser.parse_args()
+    if len(options.photos) != 2:
+        parser.error(f"two photos are matched, got {len(options.photos)}")
+    if len(present(options.photos)) < 2:
+        return
     cv2.setNumThreads(1)
     with threadpool_limits(1):
         extractor = Sift(SiftOptions(max_features=options.features))
         a, b = (extractor(np.asarray(Image.open(p).convert("RGB"))).descriptors for p in options.photos)
         sys.stdout.write(f"{len(a)} x {len(b)} descriptors, CPU seconds on one thread\n")
         two_nearest_numba(a[:16], b[:16])  # compile
-        reference = _measure("numpy reference", lambda: two_nearest_rows(a, b), 1, None)
-        _measure(
-            "fieldstone", lambda: mutual_and_distinct(*two_nearest_numba(a, b), MAX_RATIO), options.runs, reference
-        )
-        _measure("numpy float product and scans", lambda: product_and_scans(a, b), options.runs, reference)
-        _measure("OpenCV brute force, both ways", lambda: opencv(a, b), 1, reference)
+        reference = measure("numpy reference", lambda: two_nearest_rows(a, b), 1, None).matches
+        ours = measure("fieldstone", lambda: compiled(a, b), options.runs, reference)
+        product = measure("numpy float product and scans", lambda: product_and_scans(a, b), options.runs, reference)
+        measure("OpenCV brute force, both ways", lambda: opencv(a, b), 1, reference)
+    ours_s, product_s = (statistics.median(each.seconds) for each in (ours, product))
+    same = len(ours.matches & reference) / len(reference)
+    rows = [
+        Row("matching/cpu", ours_s, "s", "lower", TIMES, "numpy float product", product_s),
+        Row("matching/matches of the reference", same, "share", "higher", QUALITY),
+    ]
+    write_rows(rows, options.out)
 
 
-def _measure(name: str, run: Callable[[], np.ndarray], runs: int, reference: np.ndarray | None) -> np.ndarray:
+def measure(name: str, run: Callable[[], np.ndarray], runs: int, reference: set[tuple[int, int]] | None) -> Measured:
+    """Time an implementation and print a line."""
     seconds, matches = [], np.empty((0, 2), dtype=np.int64)
     for _ in range(runs):
         start = time.process_time()
         matches = run()
         seconds.append(time.process_time() - start)
-    rows = set(map(tuple, matches.tolist()))
-    same = len(rows if reference is None else rows & set(map(tuple, reference.tolist())))
+    rows: set[tuple[int, int]] = {(int(i), int(j)) for i, j in matches}
+    same = len(rows if reference is None else rows & reference)
     sys.stdout.write(
         f"{name:32s} best {min(seconds):6.3f}  median {statistics.median(seconds):6.3f}  "
         f"{len(rows)} matches, {same} of the reference's\n"
     )
-    return matches
+    return Measured(seconds, rows)
+
+
+def compiled(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """What the pipeline runs."""
+    return mutual_and_distinct(*two_nearest_numba(a, b), MAX_RATIO)
 
 
 def two_nearest_rows(a: np.ndarray, b: np.ndarray) -> np.ndarray:

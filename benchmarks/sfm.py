@@ -1,6 +1,6 @@
 """Photos to poses, ours against pycolmap and openmvg-rs, interleaved on one folder: time, coverage and accuracy.
 
-    python -m benchmarks.sfm FOLDER [FOLDER ...] [--known-intrinsics] [--runs 3] [--threads 2] [--size 1600]
+    python -m benchmarks.sfm [FOLDER ...] [--known-intrinsics] [--runs 3] [--threads 2] [--size 1600] [--out ROWS.json]
 
 Every run is a process of its own, so that memory and time are its own; kernels are compiled before the first.
 Errors are against the folder's ground truth after a Sim3 fit, where it has one.
@@ -23,13 +23,16 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.data import DATA, present
 from benchmarks.ground_truth import read_ground_truth
+from benchmarks.rows import QUALITY, TIMES, Better, Row, add_out_option, write_rows
 from fieldstone.evaluate.reconstruction_metrics import area_under_curve, pairwise_pose_errors_deg
 from fieldstone.io.models.colmap import read_colmap
 from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 
 THRESHOLDS_DEG = (0.5, 1.0, 3.0, 5.0, 10.0)
+DEFAULT_NAMES = ("strecha_fountain_p11", "strecha_entry_p10")
 PEERS = ("fieldstone", "incremental", "global", "openmvg")
 """The second and third are pycolmap's mappers."""
 
@@ -49,14 +52,16 @@ class Setting:
 def main() -> None:
     """Run the comparison and print one table per folder."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("folders", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_NAMES])
     parser.add_argument("--known-intrinsics", action="store_true", help="give both sides the true calibration")
     parser.add_argument("--runs", type=int, default=3, help="seeds 0 to RUNS - 1")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--size", type=int, default=1600)
     parser.add_argument("--only", choices=PEERS, action="append", help="leave the others out")
+    add_out_option(parser, "sfm")
     arguments = parser.parse_args()
-    for folder in arguments.folders:
+    kept: list[Row] = []
+    for folder in present(arguments.folders):
         truth = read_ground_truth(folder)
         photos = folder / "images" if (folder / "images").is_dir() else folder
         intrinsics = None
@@ -70,6 +75,8 @@ def main() -> None:
             setting = Setting(photos, arguments.size, arguments.threads, seed, intrinsics)
             rows += [measure(peer, setting, truth) for peer in arguments.only or PEERS[:3]]
         show(folder.name, rows)
+        kept += rows_of(folder.name + ("/known intrinsics" if arguments.known_intrinsics else ""), rows)
+    write_rows(kept, arguments.out)
 
 
 def measure(peer: str, setting: Setting, truth: Reconstruction | None) -> dict[str, Any]:
@@ -127,6 +134,28 @@ def describe(model: Reconstruction, truth: Reconstruction | None) -> dict[str, A
         row["position"] = float(align(model, truth).position_error.mean())
         row["auc"] = area_under_curve(pairwise_pose_errors_deg(model, truth), THRESHOLDS_DEG)
     return row
+
+
+def rows_of(name: str, rows: list[dict[str, Any]]) -> list[Row]:
+    """Medians over the seeds, against the incremental mapper of pycolmap where it ran."""
+    wanted: list[tuple[str, str, Better]] = [
+        ("wall_s", "s", "lower"),
+        ("cpu_s", "s", "lower"),
+        ("registered", "photos", "higher"),
+        ("points", "points", "higher"),
+        ("error_px", "px", "lower"),
+        ("position", "scene units", "lower"),
+    ]
+    found = []
+    for key, unit, better in wanted:
+        of = {peer: [row[key] for row in rows if row["peer"] == peer and key in row] for peer in PEERS}
+        if not of["fieldstone"]:
+            continue
+        other = float(np.median(of["incremental"])) if of["incremental"] else None
+        peer = None if other is None else "pycolmap incremental"
+        tolerance = TIMES if unit == "s" else QUALITY
+        found.append(Row(f"sfm/{name}/{key}", float(np.median(of["fieldstone"])), unit, better, tolerance, peer, other))
+    return found
 
 
 def show(name: str, rows: list[dict[str, Any]]) -> None:

@@ -1,6 +1,6 @@
 """Relative pose of real photo pairs with known poses: ours against PoseLib and OpenCV, interleaved pair by pair.
 
-    python -m benchmarks.two_view FOLDER [FOLDER ...] [--max-error-px 1.0] [--seeds 3] [--size 1600]
+    python -m benchmarks.two_view [FOLDER ...] [--max-error-px 1.0] [--seeds 3] [--size 1600] [--out ROWS.json]
 
 Matches: OpenCV SIFT, RootSIFT, mutual nearest neighbours with ratio 0.8 both ways. Pairs with fewer than 30 matches
 are left out. The error of a pair is the larger of the angles of rotation and of translation direction. Times are CPU
@@ -20,7 +20,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.data import DATA, present
 from benchmarks.ground_truth import read_ground_truth
+from benchmarks.rows import QUALITY, TIMES, Row, add_out_option, write_rows
 from fieldstone.evaluate.reconstruction_metrics import area_under_curve
 from fieldstone.geometry.camera import Camera, plane_from_image, rescale
 from fieldstone.geometry.rigid3 import Rigid3
@@ -30,6 +32,7 @@ from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
 
 MIN_MATCHES = 30
 CONFIDENCE = 0.9999
+DEFAULT_NAMES = ("strecha_fountain_p11", "strecha_entry_p10")
 THRESHOLDS_DEG = (0.25, 1.0, 5.0, 10.0)
 
 
@@ -47,13 +50,17 @@ class Pair:
 def main() -> None:
     """Measure every method on every pair and print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("folders", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_NAMES])
     parser.add_argument("--max-error-px", type=float, default=1.0)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--size", type=int, default=1600)
+    add_out_option(parser, "two_view")
     arguments = parser.parse_args()
+    folders = present(arguments.folders)
+    if not folders:
+        return
     cv2.setNumThreads(1)
-    pairs = [pair for folder in arguments.folders for pair in read_pairs(folder, arguments.size)]
+    pairs = [pair for folder in folders for pair in read_pairs(folder, arguments.size)]
     counts = np.median([len(pair.pixels1) for pair in pairs])
     sys.stdout.write(f"{len(pairs)} pairs, median {counts:.0f} matches, threshold {arguments.max_error_px} px\n")
     methods = available_methods(arguments.max_error_px)
@@ -73,6 +80,19 @@ def main() -> None:
         curve = area_under_curve(np.array(errors[name]), THRESHOLDS_DEG)
         areas = " ".join(f"{area:9.2f}" for area in curve)
         sys.stdout.write(f"{name:28s} {areas} {np.mean(times[name]):8.2f} {np.median(times[name]):8.2f}\n")
+    write_rows(rows_of(errors, times), arguments.out)
+
+
+def rows_of(errors: dict[str, list[float]], times: dict[str, list[float]]) -> list[Row]:
+    """Areas under the curve of errors, and CPU time, against PoseLib or else OpenCV."""
+    peer = "PoseLib" if "PoseLib" in errors else "OpenCV USAC_DEFAULT"
+    ours, others = (area_under_curve(np.array(errors[name]), THRESHOLDS_DEG) for name in ("fieldstone", peer))
+    rows = [
+        Row(f"two_view/AUC at {threshold:g} deg", float(a), "%", "higher", QUALITY, peer, float(b))
+        for threshold, a, b in zip(THRESHOLDS_DEG, ours, others, strict=True)
+    ]
+    means = (float(np.mean(times[name])) for name in ("fieldstone", peer))
+    return [*rows, Row("two_view/cpu mean", next(means), "ms", "lower", TIMES, peer, next(means))]
 
 
 def error_deg(found: Rigid3, truth: Rigid3) -> float:
