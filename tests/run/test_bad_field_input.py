@@ -131,7 +131,7 @@ def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_a_held_out_photo_of_another_size_is_found_before_training(tmp_path, monkeypatch):
     folder = write_scene(tmp_path)
-    monkeypatch.setattr(fast_fields, "prepare_grid_training", lambda *arguments, **options: pytest.fail("began to train"))
+    monkeypatch.setattr(fast_fields, "prepare_grid_training", lambda *_, **__: pytest.fail("began to train"))
     monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
     scene = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps({**scene, "w": 40, "h": 32}))
