@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from fieldstone.errors import InputError
+from fieldstone.field.base.adam import adam_estimates
 from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import PosedImage, training_rays
 from fieldstone.field.base.training import NERF, PRESETS, TINY, TrainOptions, train
@@ -15,8 +16,8 @@ from fieldstone.scene.rays import Rays, rays_from_view
 
 torch = pytest.importorskip("torch")
 
-from fieldstone.field.nerf import training as torch_training  # noqa: E402
-from fieldstone.field.nerf.training import TorchTraining, adam, torch_device, torch_workers  # noqa: E402
+from fieldstone.field.nerf.adam import BETA1, BETA2, EPSILON, adam  # noqa: E402
+from fieldstone.field.nerf.training import TorchTraining, torch_device, torch_workers  # noqa: E402
 
 SMALL_TINY = replace(TINY, width=16, position_frequencies=3, direction_frequencies=2, num_samples=8)
 SMALL_NERF = replace(
@@ -44,9 +45,9 @@ def ball_images(n=4):
     return tuple(images)
 
 
-def training(options, workers, *, images=None, seed=3):
+def training(options, workers, *, images=None, seed=3, **settings):
     rays = training_rays(ball_images() if images is None else images, FRAME)
-    return TorchTraining(options, FRAME, rays, seed, torch.device("cpu"), workers)
+    return TorchTraining(options, FRAME, rays, seed, torch.device("cpu"), workers, **settings)
 
 
 def run(options, steps, threads=1, **kwargs):
@@ -75,11 +76,10 @@ def test_resumed_training_is_bit_identical(options):
 
 
 @pytest.mark.parametrize("options", OPTIONS)
-def test_any_number_of_threads_gives_the_same_bits(options, monkeypatch):
-    monkeypatch.setattr(torch_training, "SAMPLES_PER_CHUNK", 400)
-    one, _ = run(options, 3, threads=1)
+def test_any_number_of_threads_gives_the_same_bits(options):
+    one, _ = run(options, 3, threads=1, samples_per_chunk=400)
     for threads in (2, 3):
-        assert_same_tensors(run(options, 3, threads=threads)[0], one)
+        assert_same_tensors(run(options, 3, threads=threads, samples_per_chunk=400)[0], one)
 
 
 @pytest.mark.parametrize("options", OPTIONS)
@@ -89,13 +89,12 @@ def test_other_seeds_give_other_fields(options):
 
 @pytest.mark.parametrize("loss", ["mse", "log_mse"])
 @pytest.mark.parametrize("options", OPTIONS)
-def test_chunks_add_up_to_the_gradient_of_the_whole_loss(options, loss, monkeypatch):
+def test_chunks_add_up_to_the_gradient_of_the_whole_loss(options, loss):
     """Adam's first moment after one step is 0.1 times the gradient of the loss over the whole batch."""
     options = replace(options, loss=loss)
     gradients = []
     for samples_per_chunk in (150, 10**9):
-        monkeypatch.setattr(torch_training, "SAMPLES_PER_CHUNK", samples_per_chunk)
-        gradients.append(run(options, 1)[0]["first_moment"] / 0.1)
+        gradients.append(run(options, 1, samples_per_chunk=samples_per_chunk)[0]["first_moment"] / 0.1)
     scale = np.abs(gradients[1]).max()
     assert scale > 0
     np.testing.assert_allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-5 * scale)
@@ -123,6 +122,19 @@ def test_adam_is_adam():
         optimizer.step()
         ours, first, second = adam(ours, first, second, gradient, step=step, learning_rate=0.01)
     np.testing.assert_allclose(ours.numpy(), theirs.detach().numpy(), rtol=1e-9)
+
+
+def test_adam_is_that_of_the_arrays_without_torch():
+    rng = np.random.default_rng(1)
+    values, m, v = rng.standard_normal(20).astype(np.float32), *np.zeros((2, 20), np.float32)
+    ours, first, second = (torch.from_numpy(array.copy()) for array in (values, m, v))
+    for step in range(1, 6):
+        gradient = rng.standard_normal(20).astype(np.float32)
+        numerator, denominator = adam_estimates(m, v, gradient, step, betas=(BETA1, BETA2), epsilon=EPSILON)
+        values -= np.float32(0.01) * numerator / denominator
+        ours, first, second = adam(ours, first, second, torch.from_numpy(gradient), step=step, learning_rate=0.01)
+    np.testing.assert_allclose(ours.numpy(), values, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(second.numpy(), v, rtol=1e-4)
 
 
 @pytest.mark.parametrize("options", OPTIONS)
@@ -156,11 +168,10 @@ def test_renderer_takes_any_number_of_rays():
     assert np.all(whole.depth >= FRAME.near)
 
 
-def test_a_collapsed_field_is_noticed_and_started_again(monkeypatch, caplog):
+def test_a_collapsed_field_is_noticed_and_started_again(caplog):
     """All densities zero on a black background: log(MSE) cannot move the field any more."""
-    monkeypatch.setattr(torch_training, "FLAT_STEPS", 5)
     with torch_workers(1) as workers:
-        t = training(SMALL_TINY, workers)
+        t = training(SMALL_TINY, workers, max_flat_steps=5)
         tensors = t.to_tensors(t.start())
         tensors["parameters"][-1] = -100.0  # the bias of the density
         state = t.from_tensors(tensors)
@@ -179,10 +190,9 @@ def test_a_collapsed_field_is_noticed_and_started_again(monkeypatch, caplog):
         assert np.isfinite(second_report.loss)
 
 
-def test_numbers_that_are_not_finite_are_a_collapse(monkeypatch):
-    monkeypatch.setattr(torch_training, "FLAT_STEPS", 3)
+def test_numbers_that_are_not_finite_are_a_collapse():
     with torch_workers(1) as workers:
-        t = training(SMALL_TINY, workers)
+        t = training(SMALL_TINY, workers, max_flat_steps=3)
         tensors = t.to_tensors(t.start())
         tensors["parameters"][0] = np.inf
         state, curve = train(t, t.from_tensors(tensors), budget_s=None, max_steps=4)

@@ -25,11 +25,10 @@ def render_ball(rays):
     return RenderedRays(np.where(hit[:, None], 0.5 + 0.5 * normals, 0.0), np.where(hit, t, 9.0), hit.astype(float))
 
 
-def test_view_of_a_ball(monkeypatch):
-    monkeypatch.setattr(views, "RAYS_AT_ONCE", 37)
+def test_view_of_a_ball():
     camera = Camera("PINHOLE", 40, 30, np.array([35.0, 35.0, 19.0, 14.0]))
     pose = Rigid3(rotation.exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, -0.1, 4.0]))
-    view = render_view(render_ball, camera, pose)
+    view = render_view(render_ball, camera, pose, rays_at_once=37)
     assert view.rgb.shape == (30, 40, 3)
     # The centre of the ball is seen where the camera projects it, and its outline is the expected ellipse.
     row, column = np.nonzero(view.opacity)

@@ -18,7 +18,7 @@ Position = Callable[[Int[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 
 
 def fused(
-    share: Float[np.ndarray, "x y z"],
+    solid_fraction: Float[np.ndarray, "x y z"],
     level: float,
     position: Position,
     views: Iterable[tuple[Camera, Rigid3, Float[np.ndarray, "h w"]]],
@@ -30,14 +30,14 @@ def fused(
     where no view says anything, the given grid stays.
 
     Args:
-        share: What is at least `level` is solid.
+        solid_fraction: What is at least `level` is solid.
         position: Of points of the grid in the world, from their indices.
         views: Camera, `cam_from_world` and depths along the rays; infinite where a view looks through.
 
     Source:
         `curless1996`, section 3, with equal weights.
     """
-    solid = share >= level
+    solid = solid_fraction >= level
     inner = ndimage.binary_erosion(solid, iterations=REACH, border_value=1)
     index = np.argwhere(ndimage.binary_dilation(solid, iterations=REACH) > inner)
     points = position(index)
@@ -55,6 +55,6 @@ def fused(
         total[rows] += np.minimum(ahead, 1.0)
         count[rows] += 1
     out = solid.astype(np.float32)
-    seen = count > 0
-    out[tuple(index[seen].T)] = 0.5 - 0.5 * total[seen] / count[seen]
+    observed = count > 0
+    out[tuple(index[observed].T)] = 0.5 - 0.5 * total[observed] / count[observed]
     return out

@@ -38,28 +38,33 @@ def solidity(
 
 
 def cleaned(
-    share: Float[np.ndarray, "x y z"], level: float, min_part: float = MIN_PART
+    solid_fraction: Float[np.ndarray, "x y z"], level: float, min_part: float = MIN_PART
 ) -> tuple[Float[np.ndarray, "x y z"], int]:
     """The grid without floaters and without holes that nobody can see into; also how many floaters there were.
 
     A part is what hangs together across faces. A hole is a part of the empty space that does not reach the border of
     the grid: light never came there, so a field says nothing about it.
     """
-    parts, count = _parts(share >= level)
+    parts, count = _parts(solid_fraction >= level)
     if count == 0:
         raise InputError("the field is nowhere dense enough for a surface; train it longer, or ask for a lower --level")
     sizes = np.bincount(parts.reshape(-1), minlength=count + 1)[1:]
     floating = np.append(False, sizes < min_part * sizes.max())
-    share = np.where(floating[parts], 0.0, share)
-    holes, _ = _parts(np.pad(share < level, 1, constant_values=True))
+    solid_fraction = np.where(floating[parts], 0.0, solid_fraction)
+    holes, _ = _parts(np.pad(solid_fraction < level, 1, constant_values=True))
     inner = (holes != holes[0, 0, 0]) & (holes > 0)
-    return np.where(inner[1:-1, 1:-1, 1:-1], 1.0, share).astype(np.float32), int(np.count_nonzero(floating))
+    return np.where(inner[1:-1, 1:-1, 1:-1], 1.0, solid_fraction).astype(np.float32), int(np.count_nonzero(floating))
 
 
 def surface(
-    share: Float[np.ndarray, "x y z"], level: float, lower: Float[np.ndarray, "3"], spacing: float, *, closed: bool
+    solid_fraction: Float[np.ndarray, "x y z"],
+    level: float,
+    lower: Float[np.ndarray, "3"],
+    spacing: float,
+    *,
+    closed: bool,
 ) -> Mesh:
-    """The surface on which the share has a value, in the frame of `lower`.
+    """The surface on which the solid fraction has a value, in the frame of `lower`.
 
     Args:
         closed: Where matter reaches the border of the grid, the surface follows the border; else it ends there.
@@ -67,10 +72,10 @@ def surface(
     Source:
         `lorensen1987`, in the variant of scikit-image.
     """
-    padded = np.pad(share, 1)
+    padded = np.pad(solid_fraction, 1)
     vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent", allow_degenerate=False)
     if not closed:
-        inside = np.all((vertices >= 1.0) & (vertices <= np.array(share.shape)), axis=1)
+        inside = np.all((vertices >= 1.0) & (vertices <= np.array(solid_fraction.shape)), axis=1)
         faces = faces[inside[faces].all(axis=1)]
         used = np.unique(faces)
         faces, vertices = np.searchsorted(used, faces), vertices[used]

@@ -34,8 +34,8 @@ class RenderedView:
 def depth_image(view: RenderedView, near: float, far: float) -> Float[np.ndarray, "h w 3"]:
     """Grey values that are linear in 1 / depth, from 1 at `near` to 0 at `far`; black where little is seen."""
     inverse = 1.0 / np.maximum(view.depth, 1e-12)
-    share = np.clip((inverse - 1.0 / far) / (1.0 / near - 1.0 / far), 0.0, 1.0)
-    return np.repeat(np.where(view.opacity > 0.5, share, 0.0)[:, :, None], 3, axis=2)
+    grey = np.clip((inverse - 1.0 / far) / (1.0 / near - 1.0 / far), 0.0, 1.0)
+    return np.repeat(np.where(view.opacity > 0.5, grey, 0.0)[:, :, None], 3, axis=2)
 
 
 def normal_image(view: RenderedView, camera: Camera) -> Float[np.ndarray, "h w 3"]:
@@ -51,8 +51,8 @@ def normal_image(view: RenderedView, camera: Camera) -> Float[np.ndarray, "h w 3
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
     facing = np.sum(normals * points, axis=2, keepdims=True)
     normals = np.where(facing > 0, -normals, normals) * [1.0, -1.0, -1.0]
-    seen = (view.opacity > 0.5)[:, :, None] & np.isfinite(normals)
-    return np.where(seen, 0.5 + 0.5 * normals, 0.0)
+    num_photos = (view.opacity > 0.5)[:, :, None] & np.isfinite(normals)
+    return np.where(num_photos, 0.5 + 0.5 * normals, 0.0)
 
 
 def confidence_image(
@@ -71,7 +71,7 @@ def confidence_image(
     rays = rays_from_view(camera, cam_from_world)
     depth = surface_depth(view.depth, view.opacity, far, least=1e-3).reshape(-1, 1)
     points = rays.origins + rays.directions * np.where(np.isfinite(depth), depth, np.nan)
-    seen = np.zeros(len(points), dtype=np.int64)
+    num_photos = np.zeros(len(points), dtype=np.int64)
     for photo, pose in photos:
         in_cam = pose.apply(points)
         towards = points - pose.target_origin_in_source()
@@ -80,19 +80,28 @@ def confidence_image(
         candidate = np.flatnonzero(aligned & (in_cam[:, 2] > 0) & np.isfinite(in_cam).all(axis=1))
         pixels = image_from_cam(photo, in_cam[candidate])
         inside = np.all((pixels >= 0) & (pixels < [photo.width, photo.height]), axis=1)
-        seen[candidate[inside]] += 1
-    share = np.where(seen > 0, 1.0 - 0.5 ** np.maximum(seen - 1.0, 0.0), 0.0).reshape(view.opacity.shape)
-    return np.repeat((share * view.opacity)[:, :, None], 3, axis=2)
+        num_photos[candidate[inside]] += 1
+    confidence = np.where(num_photos > 0, 1.0 - 0.5 ** np.maximum(num_photos - 1.0, 0.0), 0.0).reshape(
+        view.opacity.shape
+    )
+    return np.repeat((confidence * view.opacity)[:, :, None], 3, axis=2)
 
 
-def render_view(render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3) -> RenderedView:
+def render_view(
+    render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3, *, rays_at_once: int = RAYS_AT_ONCE
+) -> RenderedView:
     """What the camera sees, with `render_rays` for rays in the world."""
-    (view,) = progressive_views(render_rays, camera, cam_from_world, strides=(1,))
+    (view,) = progressive_views(render_rays, camera, cam_from_world, strides=(1,), rays_at_once=rays_at_once)
     return view
 
 
 def progressive_views(
-    render_rays: RayRenderer, camera: Camera, cam_from_world: Rigid3, *, strides: Sequence[int] = (8, 4, 2, 1)
+    render_rays: RayRenderer,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    *,
+    strides: Sequence[int] = (8, 4, 2, 1),
+    rays_at_once: int = RAYS_AT_ONCE,
 ) -> Iterator[RenderedView]:
     """What the camera sees, sharper and sharper, for who moves through a scene and does not wait for all pixels.
 
@@ -111,16 +120,16 @@ def progressive_views(
     for stride in strides:
         row, column = (np.minimum(np.arange(n) // stride * stride + stride // 2, n - 1) for n in shape)
         shown = row[:, None] * camera.width + column
-        wanted = missing.copy()
+        requested = missing.copy()
         if stride > 1:
-            wanted[:] = False
-            wanted[shown] = missing[shown]
-        wanted = np.flatnonzero(wanted)
-        for start in range(0, len(wanted), RAYS_AT_ONCE):
-            rows = wanted[start : start + RAYS_AT_ONCE]
+            requested[:] = False
+            requested[shown] = missing[shown]
+        requested = np.flatnonzero(requested)
+        for start in range(0, len(requested), rays_at_once):
+            rows = requested[start : start + rays_at_once]
             rendered = render_rays(Rays(rays.origins[rows], rays.directions[rows], rays.pixel_radius[rows]))
             rgb[rows], depth[rows], opacity[rows] = rendered.rgb, rendered.depth, rendered.opacity
-        missing[wanted] = False
+        missing[requested] = False
         if stride > 1:
             yield RenderedView(rgb[shown], depth[shown], opacity[shown])
         else:

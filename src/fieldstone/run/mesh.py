@@ -149,7 +149,7 @@ def normalized_mesh(
     spacing = max(finest, float(np.max(upper - lower)) / (cells or MAX_CELLS))
     if cells is not None:
         spacing = float(np.max(upper - lower)) / cells
-    share, floaters = cleaned(solidity(field.density, lower, upper, spacing, LENGTH_CELLS * finest), level)
+    solid_fraction, floaters = cleaned(solidity(field.density, lower, upper, spacing, LENGTH_CELLS * finest), level)
     world = frame.normalized_from_world.inverse()
 
     def position(index: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -162,9 +162,9 @@ def normalized_mesh(
             seen = render_view(render_rays, camera, pose)
             yield camera, pose, surface_depth(seen.depth, seen.opacity, frame.far * world.scale)
 
-    share, more = cleaned(fused(share, level, position, views()), SURFACE)
+    solid_fraction, more = cleaned(fused(solid_fraction, level, position, views()), SURFACE)
     floaters += more
-    mesh = surface(share, SURFACE, lower, spacing, closed=not space.is_open)
+    mesh = surface(solid_fraction, SURFACE, lower, spacing, closed=not space.is_open)
     logger.info("surface of %d faces, %d floaters removed", len(mesh.faces), floaters)
     centers = frame.normalized_from_world.apply(poses.target_origin_in_source())
     if not space.is_projective:

@@ -126,9 +126,9 @@ def distance_along(
     projection: Projection,
     origins: Float[np.ndarray, "r 3"],
     directions: Float[np.ndarray, "r 3"],
-    share: Float[np.ndarray, "r"],
+    fraction: Float[np.ndarray, "r"],
 ) -> Float[np.ndarray, "r"]:
-    """Distance from the origin of a ray, before projection, of the point at a share in [0, 1) of its segment."""
+    """Distance from the origin of a ray, before projection, of the point at a fraction in [0, 1) of its segment."""
     axis = projection.R[2].astype(np.float64)
-    z = projection.near / np.maximum(1.0 - share, 1e-6)
+    z = projection.near / np.maximum(1.0 - fraction, 1e-6)
     return (z - (origins - projection.center) @ axis) / np.maximum(directions @ axis, 1e-3)

@@ -24,7 +24,7 @@ DIRECTIONS = 8
 class Decoder(NamedTuple):
     """The weights; float32, flat for the kernels. `width` is the number of interpolated values per sample.
 
-    Rows of F that belong to raw densities stay 0 and are never used.
+    Rows of F that belong to log densities stay 0 and are never used.
     """
 
     feature_weights: np.ndarray
@@ -71,7 +71,7 @@ def decode(
     """Colours in (0, 1); float64.
 
     Args:
-        features: Interpolated values, level by level; raw densities among them are ignored.
+        features: Interpolated values, level by level; log densities among them are ignored.
     """
     weights = decoder.feature_weights.reshape(-1, HIDDEN)[: features.shape[1]].astype(np.float64)
     weights[::CHANNELS] = 0.0

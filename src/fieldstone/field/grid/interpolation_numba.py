@@ -44,7 +44,7 @@ AHEAD = 6
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def interpolate_point_numba(grid, x, y, z, out, start):
-    """`layout.interpolate` of one point into out[start:start + 4 l]; returns the sum of the raw densities."""
+    """`layout.interpolate` of one point into out[start:start + 4 l]; returns the log density without its bias."""
     one = np.float32(1)
     log_density = np.float32(0)
     for level in range(grid.per_unit.shape[0]):
@@ -136,13 +136,14 @@ def add_gradient(grid, level, half, counts, capacity, positions, gradient, width
 def step_touched(table, mean_square, gradient, touched, first, last, rates, decay_factors, decay, epsilon):
     """One RMSprop step of the values with a gradient in blocks `first` to `last` (multiples of 8); clears both.
 
-    v <- decay v + (1 - decay) g^2,   p <- kept p - rate g / (sqrt(v) + epsilon).
+    v <- decay v + (1 - decay) g^2,   p <- factor p - rate g / (sqrt(v) + epsilon).
 
-    rates, kept: (8,) by channel, twice. Values that no sample touched keep p and v: a vertex that is seen once in a
-    hundred batches must not drift in between.
+    rates, decay_factors: (8,) by channel, twice. Values that no sample touched keep p and v: a vertex that is seen
+    once in a hundred batches must not drift in between.
 
     Source:
-        `tieleman2012`; kept as in `loshchilov2019`, algorithm 2. Departure: no step where the gradient is exactly 0.
+        `tieleman2012`; the factor is the weight decay of `loshchilov2019`, algorithm 2. Departure: no step where the
+        gradient is exactly 0.
     """
     zero, memory, new, tiny = spread8(0), spread8(decay), spread8(np.float32(1) - decay), spread8(epsilon)
     rate, factor = load8(rates, 0), load8(decay_factors, 0)
@@ -179,7 +180,7 @@ def step_by_sample(
     """The step of `step_touched` for every sample at once, without a gradient table, on one half of one level.
 
     On the finest level hardly two samples of a batch meet in a vertex, and what costs is memory: this reads and
-    writes value and velocity of 32 bytes per edge where the two-pass way also fills, reads and clears a gradient.
+    writes value and mean square of 32 bytes per edge where the two-pass way also fills, reads and clears a gradient.
     """
     one = np.float32(1)
     memory, new, tiny = spread8(decay), spread8(one - decay), spread8(epsilon)

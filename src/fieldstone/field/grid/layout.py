@@ -1,7 +1,7 @@
 """The feature grids of the grid field: dense vertex grids of doubling resolution over one box.
 
-Each vertex holds four numbers: a share of the raw density and three colour features. A point takes the trilinear
-mean of the eight vertices around it on every level. Raw densities add up over the levels, so the coarse ones move
+Each vertex holds four numbers: a part of the log density and three colour features. A point takes the trilinear
+mean of the eight vertices around it on every level. Log densities add up over the levels, so the coarse ones move
 whole regions while the fine ones still know nothing; features are handed to the decoder side by side.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 CHANNELS = 4
-"""Numbers per vertex: raw density, then three colour features."""
+"""Numbers per vertex: log density, then three colour features."""
 
 PADDING = 128
 """Unused numbers behind each level, so that eight-lane loads at its last vertex stay inside the table; levels begin at

@@ -45,7 +45,7 @@ class March(NamedTuple):
 
     step: np.float32
     density_bias: np.float32
-    """Raw density of an untouched grid; the density is exp(raw + raw_offset)."""
+    """Log density of an untouched grid; the density is exp(density_bias + sum of the levels)."""
     depth_scale: np.float32
     """Optical depth of one step at density 1."""
     min_weight: np.float32
@@ -106,9 +106,9 @@ def steps_out_of_cell(box, step, distance, i, j, k, x, y, z, dx, dy, dz):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capacity, width, out, queue):
-    """Append the samples of one ray behind the n there are; returns (n, light left, steps asked).
+    """Append the samples of one ray behind the n there are; returns (n, transmittance, density evaluations).
 
-    jitter: share of a step before the first sample. far: where the ray ends at the latest.
+    jitter: fraction of a step before the first sample. far: where the ray ends at the latest.
     """
     zero, one = np.float32(0), np.float32(1)
     contracted = box.space.kind == CONTRACTED
@@ -184,10 +184,10 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def march_rays(grid, box, march, origins, directions, jitter, far, num_rays, width, out, first, end_transmittance):
-    """March rays until their samples fill the room; returns (rays, samples, steps asked).
+    """March rays until their samples fill the capacity; returns (rays, samples, density evaluations).
 
-    origins, directions: flat (r, 3). first: (r + 1) row of the first sample of each ray. passed: (r) light left.
-    A ray that found its room taken is left to the next call.
+    origins, directions: flat (r, 3). first: (r + 1) row of the first sample of each ray. end_transmittance: (r).
+    A ray that found the capacity taken is left to the next call.
     """
     capacity = out.alpha.shape[0]
     queue = np.empty(QUEUE * 4, np.float32)

@@ -83,7 +83,7 @@ def rays_that_hit(box, origin, directions, out):  # (3,), (r, 3) -> (r,) uint8
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def used_cells(grid, cells, cell_size, spacing, density_bias, threshold, first, last):
-    """Clear occupied cells in slabs `first` to `last` whose raw density is at most `threshold` at all fine vertices.
+    """Clear occupied cells in slabs `first` to `last` whose log density is at most `threshold` at all fine vertices.
 
     cells: (x, y, z) bool. spacing: between the vertices of the finest level; those on the faces count too.
     """

@@ -15,24 +15,27 @@ from numba import njit
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def at(array, index):
+    """As `simd_numba` says."""
     return array.reshape(-1)[index]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def prefetch(array, index):
-    pass
+    """As `simd_numba` says."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def load4(array, i):
+    """As `simd_numba` says."""
     return array[i], array[i + 1], array[i + 2], array[i + 3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def load8(array, i):
+    """As `simd_numba` says."""
     return (
         *(array[i], array[i + 1], array[i + 2], array[i + 3]),
         *(array[i + 4], array[i + 5], array[i + 6], array[i + 7]),
@@ -42,6 +45,7 @@ def load8(array, i):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def store4(array, i, v):
+    """As `simd_numba` says."""
     for k in range(4):
         array[i + k] = v[k]
 
@@ -49,6 +53,7 @@ def store4(array, i, v):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def store8(array, i, v):
+    """As `simd_numba` says."""
     for k in range(8):
         array[i + k] = v[k]
 
@@ -56,6 +61,7 @@ def store8(array, i, v):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def add8(a, b):
+    """As `simd_numba` says."""
     return (
         *(a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]),
         *(a[4] + b[4], a[5] + b[5], a[6] + b[6], a[7] + b[7]),
@@ -65,6 +71,7 @@ def add8(a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def sub8(a, b):
+    """As `simd_numba` says."""
     return (
         *(a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3]),
         *(a[4] - b[4], a[5] - b[5], a[6] - b[6], a[7] - b[7]),
@@ -74,6 +81,7 @@ def sub8(a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def mul8(a, b):
+    """As `simd_numba` says."""
     return (
         *(a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3]),
         *(a[4] * b[4], a[5] * b[5], a[6] * b[6], a[7] * b[7]),
@@ -83,6 +91,7 @@ def mul8(a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def div8(a, b):
+    """As `simd_numba` says."""
     return (
         *(a[0] / b[0], a[1] / b[1], a[2] / b[2], a[3] / b[3]),
         *(a[4] / b[4], a[5] / b[5], a[6] / b[6], a[7] / b[7]),
@@ -92,6 +101,7 @@ def div8(a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def fma8(a, b, c):
+    """As `simd_numba` says."""
     return add8(mul8(a, b), c)
 
 
@@ -104,6 +114,7 @@ def _root(x):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def sqrt8(a):
+    """As `simd_numba` says."""
     return (
         *(_root(a[0]), _root(a[1]), _root(a[2]), _root(a[3])),
         *(_root(a[4]), _root(a[5]), _root(a[6]), _root(a[7])),
@@ -119,6 +130,7 @@ def _positive(x):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def positive8(a):
+    """As `simd_numba` says."""
     return (
         *(_positive(a[0]), _positive(a[1]), _positive(a[2]), _positive(a[3])),
         *(_positive(a[4]), _positive(a[5]), _positive(a[6]), _positive(a[7])),
@@ -134,6 +146,7 @@ def _chosen(test, a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def where_nonzero8(t, a, b):
+    """As `simd_numba` says."""
     return (
         *(_chosen(t[0], a[0], b[0]), _chosen(t[1], a[1], b[1]), _chosen(t[2], a[2], b[2]), _chosen(t[3], a[3], b[3])),
         *(_chosen(t[4], a[4], b[4]), _chosen(t[5], a[5], b[5]), _chosen(t[6], a[6], b[6]), _chosen(t[7], a[7], b[7])),
@@ -143,6 +156,7 @@ def where_nonzero8(t, a, b):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def halves8(low, high):
+    """As `simd_numba` says."""
     a, b = np.float32(low), np.float32(high)
     return a, a, a, a, b, b, b, b
 
@@ -150,34 +164,40 @@ def halves8(low, high):
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def spread8(scalar):
+    """As `simd_numba` says."""
     return halves8(scalar, scalar)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def spread8_at(array, index):
+    """As `simd_numba` says."""
     return spread8(array[index])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def twice8(v):
+    """As `simd_numba` says."""
     return (*v, *v)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def fold8(v):
+    """As `simd_numba` says."""
     return v[0] + v[4], v[1] + v[5], v[2] + v[6], v[3] + v[7]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def first_lane(v):
+    """As `simd_numba` says."""
     return v[0]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
 def sum8(v):
+    """As `simd_numba` says."""
     return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))

@@ -7,7 +7,7 @@ changes them, for a checkpoint, and for rendering.
 
 Departures from the step on the CPU, beside rounding:
 
-- Rays and samples are one batch, not `GridPlan.num_chunks` chunks; its room is that of all chunks together.
+- Rays and samples are one batch, not `GridPlan.num_chunks` chunks; its capacity is that of all chunks together.
 - All levels move batch by batch; `GridPlan.immediate_levels` is about the CPU's memory.
 - A GPU adds in no fixed order: the same plan gives the same field to rounding, not the same bytes.
 
@@ -190,7 +190,7 @@ class TorchGridTraining:
         )
 
     def _drawn(self, host: GridState, count: int, march: March) -> tuple[TorchRays, int]:
-        """The next `count` rays of the table behind those to known points, and how many these are."""
+        """The next `count` rays of the table behind those to points, and how many these are."""
         training = self.training
         num_depth_rays = int(training.num_depth_rays(host).sum())
         rays = ray_buffers(num_depth_rays + count)

@@ -23,18 +23,17 @@ from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, StepReport
 from fieldstone.field.base.ray_dataset import TrainingRays
 from fieldstone.field.base.training import TrainOptions
+from fieldstone.field.nerf.adam import adam
 from fieldstone.field.nerf.networks import initial_parameters, network_size, render_rays, split_parameters
 from fieldstone.scene.rays import Rays
 
 logger = logging.getLogger(__name__)
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-7
-
 SAMPLES_PER_CHUNK = 4096
 """Network evaluations of one chunk on a CPU: 2 MB per layer of 128 units, measured the fastest."""
 
 MIN_CONTRAST = 0.01
-FLAT_STEPS = 30
+MAX_FLAT_STEPS = 30
 MAX_ATTEMPTS = 4
 """A field whose images are flat (spread below 1 % of that of the photos) for this many steps has collapsed: every
 density is zero or every colour saturated, gradients vanish, and it never recovers. It is started again, at most
@@ -92,6 +91,10 @@ class TorchTraining:
     seed: int
     device: torch.device
     workers: Executor
+    samples_per_chunk: int = SAMPLES_PER_CHUNK
+    """Network evaluations of one chunk on a CPU."""
+    max_flat_steps: int = MAX_FLAT_STEPS
+    """Steps with flat images after which training begins again."""
 
     @property
     def num_networks(self) -> int:
@@ -102,7 +105,7 @@ class TorchTraining:
     def rays_per_chunk(self) -> int:
         """Rays that are evaluated together: few on a CPU, to stay in its cache."""
         evaluations = self.options.num_samples + self.options.num_fine_samples
-        return max(1, (SAMPLES_PER_CHUNK if self.device.type == "cpu" else 1 << 20) // evaluations)
+        return max(1, (self.samples_per_chunk if self.device.type == "cpu" else 1 << 20) // evaluations)
 
     def start(self) -> TorchState:
         """Random weights, moments zero."""
@@ -244,7 +247,7 @@ class TorchTraining:
         # Written so that colours that are not finite count as flat.
         has_contrast = total.contrast() >= MIN_CONTRAST * float(np.std(colors, axis=0).max())
         flat_steps = 0 if has_contrast else state.flat_steps + 1
-        if flat_steps >= FLAT_STEPS and state.attempt + 1 < MAX_ATTEMPTS:
+        if flat_steps >= self.max_flat_steps and state.attempt + 1 < MAX_ATTEMPTS:
             logger.warning(
                 "the field shows one flat colour since %d steps and would not recover; attempt %d starts afresh",
                 flat_steps,
@@ -294,23 +297,3 @@ class ChunkLoss:
         mean = self.rgb_sum / self.num_rays
         variance = self.rgb_squared_sum / self.num_rays - mean**2
         return float(np.sqrt(np.maximum(variance, 0.0).max()))
-
-
-def adam(
-    parameters: Float[Tensor, "p"],
-    first_moment: Float[Tensor, "p"],
-    second_moment: Float[Tensor, "p"],
-    gradient: Float[Tensor, "p"],
-    *,
-    step: int,
-    learning_rate: float,
-) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"], Float[Tensor, "p"]]:
-    """Parameters and moments after one step of Adam; `step` counts from 1.
-
-    Source:
-        `kingma2015`, algorithm 1; beta1 0.9, beta2 0.999, epsilon 1e-7 as in `mildenhall2020`.
-    """
-    first = BETA1 * first_moment + (1 - BETA1) * gradient
-    second = BETA2 * second_moment + (1 - BETA2) * gradient**2
-    denominator = torch.sqrt(second / (1 - BETA2**step)) + EPSILON
-    return parameters - (learning_rate / (1 - BETA1**step)) * first / denominator, first, second
