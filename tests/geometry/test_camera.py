@@ -3,13 +3,13 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import (
-    CAMERA_MODELS,
     Camera,
     bearings_from_image,
     image_from_cam,
     image_from_cam_jacobian,
     rescale,
 )
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from matchers import check_jacobian
 
 PARAMS = {

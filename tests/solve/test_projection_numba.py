@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera, image_from_cam_jacobian
+from fieldstone.geometry.camera import Camera, image_from_cam_jacobian
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from fieldstone.solve.projection.projection_numba import MAX_CAMERA_PARAMS, image_from_cam_numba, robust_numba
 from fieldstone.solve.robust.loss import cauchy, huber, soft_l1, trivial
 

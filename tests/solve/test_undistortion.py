@@ -1,6 +1,7 @@
 import numpy as np
 
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera, plane_from_image
+from fieldstone.geometry.camera import Camera, plane_from_image
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from fieldstone.solve.projection.undistortion import plane_from_images
 
 COEFFICIENTS = np.array([-0.3, 0.05, 2e-3, -1e-3, 0.01, 0.02, -0.01, 0.005])

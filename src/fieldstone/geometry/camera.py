@@ -6,52 +6,14 @@ Camera frame: x right, y down, z forward. See docs/conventions.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from fieldstone.geometry import distortion
+from fieldstone.geometry.camera_models import CAMERA_MODELS, CameraModel
 
 MAX_NEWTON_STEPS = 50
-
-
-@dataclass(frozen=True)
-class CameraModel:
-    """How the parameter vector of one model is read: focal length(s), principal point, distortion."""
-
-    name: str
-    colmap_id: int
-    num_focal: int
-    """1: one focal length f for both axes; 2: fx, fy."""
-    coefficient_names: tuple[str, ...]
-    distort: Callable[[np.ndarray, np.ndarray], distortion.Distorted]
-
-    @property
-    def param_names(self) -> tuple[str, ...]:
-        """Names in the order of `Camera.params`."""
-        focal = ("f",) if self.num_focal == 1 else ("fx", "fy")
-        return (*focal, "cx", "cy", *self.coefficient_names)
-
-    @property
-    def num_params(self) -> int:
-        """Length of `Camera.params`."""
-        return self.num_focal + 2 + len(self.coefficient_names)
-
-
-CAMERA_MODELS: dict[str, CameraModel] = {
-    model.name: model
-    for model in (
-        CameraModel("SIMPLE_PINHOLE", 0, 1, (), distortion.no_distortion),
-        CameraModel("PINHOLE", 1, 2, (), distortion.no_distortion),
-        CameraModel("SIMPLE_RADIAL", 2, 1, ("k",), distortion.radial),
-        CameraModel("RADIAL", 3, 1, ("k1", "k2"), distortion.radial),
-        CameraModel("OPENCV", 4, 2, ("k1", "k2", "p1", "p2"), distortion.brown),
-        CameraModel("OPENCV_FISHEYE", 5, 2, ("k1", "k2", "k3", "k4"), distortion.fisheye),
-        CameraModel("FULL_OPENCV", 6, 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), distortion.rational),
-    )
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,8 +63,15 @@ def triangulate_midpoint(
 ) -> Float[np.ndarray, "3"]:
     """The point nearest to v rays in the least-squares sense: sum (I - d d^T) x = sum (I - d d^T) c.
 
+    Args:
+        centers: Where each ray starts.
+        directions: Unit vectors, in the same frame.
+
     Raises:
         numpy.linalg.LinAlgError: All rays are parallel.
+
+    Source:
+        `hartley2004`, chapter 12 (the midpoint method), for any number of rays.
     """
     projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     return np.linalg.solve(projectors.sum(axis=0), np.einsum("vij,vj->i", projectors, centers))

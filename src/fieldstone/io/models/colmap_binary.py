@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from fieldstone.geometry.rotation import to_wxyz
 from fieldstone.io.files.binary import read_array, read_count, read_struct, refuse_at
 from fieldstone.io.files.names import MAX_NAME_BYTES

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera
+from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import from_wxyz
 from fieldstone.io.files.names import name_problem

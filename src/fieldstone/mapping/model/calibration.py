@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
-from fieldstone.geometry.camera import CAMERA_MODELS, Camera, plane_from_image
+from fieldstone.geometry.camera import Camera, plane_from_image
+from fieldstone.geometry.camera_models import CAMERA_MODELS
 from fieldstone.solve.bundle.camera_prior import CameraPrior
 
 PRINCIPAL_POINT_SIGMA = 0.02

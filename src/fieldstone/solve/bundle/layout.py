@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from fieldstone.geometry.camera import CAMERA_MODELS
 from fieldstone.solve.algebra.sorting_numba import counting_order_numba, coupled_cameras_numba
 from fieldstone.solve.bundle.problem import BundleProblem
+from fieldstone.solve.projection.projection_numba import NUM_FOCAL
 
 MIN_VIEWS_TO_ORDER = 100
 
@@ -81,7 +81,7 @@ class BundleLayout(NamedTuple):
     @property
     def two_focal(self) -> Bool[np.ndarray, "c"]:
         """Cameras whose first two parameters are fx and fy."""
-        return np.array([spec.num_focal == 2 for spec in CAMERA_MODELS.values()])[self.model]
+        return np.array(NUM_FOCAL)[self.model] == 2
 
     @property
     def num_columns(self) -> int:

@@ -10,9 +10,16 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-MAX_CAMERA_PARAMS = 12
-"""Focal lengths, principal point and coefficients of the longest model, FULL_OPENCV."""
-MAX_COEFFICIENTS = 8
+from fieldstone.geometry.camera_models import CAMERA_MODELS
+
+_BY_ID = {spec.colmap_id: spec for spec in CAMERA_MODELS.values()}
+_IDS = range(max(_BY_ID) + 1)
+NUM_FOCAL = tuple(_BY_ID[model].num_focal if model in _BY_ID else 0 for model in _IDS)
+"""Of each model, by its number; 0 for numbers without a model."""
+NUM_COEFFICIENTS = tuple(len(_BY_ID[model].coefficient_names) if model in _BY_ID else 0 for model in _IDS)
+MAX_COEFFICIENTS = max(NUM_COEFFICIENTS)
+MAX_CAMERA_PARAMS = 4 + MAX_COEFFICIENTS
+"""Focal lengths, principal point and coefficients of the longest model."""
 SMALL_RADIUS = 1e-8
 
 
@@ -70,7 +77,7 @@ def distort_numba(model, k, u, v, J_k):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _distort_fisheye(k, u, v, r2, J_k):
-    """Equidistant fisheye: `geometry.distortion.fisheye` for one point."""
+    """Equidistant fisheye: `geometry.camera_models.fisheye` for one point."""
     r = np.sqrt(r2)
     theta = np.arctan(r)
     theta2 = theta * theta
@@ -106,8 +113,8 @@ def image_from_cam_numba(model, params, x, y, z, J_point, J_params, J_k):
     inv_z = 1.0 / z
     u = x * inv_z
     v = y * inv_z
-    two_focal = model == 1 or model >= 4
-    c = 2 if two_focal else 1
+    c = NUM_FOCAL[model]
+    two_focal = c == 2
     fx = params[0]
     fy = params[c - 1]
     u_d, v_d, du_du, du_dv, dv_du, dv_dv = distort_numba(model, params[c + 2 :], u, v, J_k)
@@ -126,8 +133,7 @@ def image_from_cam_numba(model, params, x, y, z, J_point, J_params, J_k):
     J_params[1, c] = 0.0
     J_params[0, c + 1] = 0.0
     J_params[1, c + 1] = 1.0
-    num_coefficients = 0 if model <= 1 else (model - 1 if model <= 3 else (8 if model == 6 else 4))
-    for i in range(num_coefficients):
+    for i in range(NUM_COEFFICIENTS[model]):
         J_params[0, c + 2 + i] = fx * J_k[0, i]
         J_params[1, c + 2 + i] = fy * J_k[1, i]
     return fx * u_d + params[c], fy * v_d + params[c + 1]

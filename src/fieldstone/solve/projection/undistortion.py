@@ -10,7 +10,13 @@ from jaxtyping import Float, Int
 from numba import njit
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.solve.projection.projection_numba import MAX_CAMERA_PARAMS, MAX_COEFFICIENTS, distort_numba
+from fieldstone.solve.projection.projection_numba import (
+    MAX_CAMERA_PARAMS,
+    MAX_COEFFICIENTS,
+    NUM_COEFFICIENTS,
+    NUM_FOCAL,
+    distort_numba,
+)
 
 MAX_STEPS = 50
 
@@ -38,11 +44,11 @@ def _undistort(models, params, camera, pixels, uv):
     J_k = np.empty((2, MAX_COEFFICIENTS))
     for n in range(len(pixels)):
         p, model = params[camera[n]], models[camera[n]]
-        c = 2 if model == 1 or model >= 4 else 1
+        c = NUM_FOCAL[model]
         u_d = (pixels[n, 0] - p[c]) / p[0]
         v_d = (pixels[n, 1] - p[c + 1]) / p[c - 1]
         u, v = u_d, v_d
-        if model > 1:
+        if NUM_COEFFICIENTS[model] > 0:
             for _ in range(MAX_STEPS):
                 a, b, du_du, du_dv, dv_du, dv_dv = distort_numba(model, p[c + 2 :], u, v, J_k)
                 det = du_du * dv_dv - du_dv * dv_du

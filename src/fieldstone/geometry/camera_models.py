@@ -1,6 +1,9 @@
-"""Lens distortion on the plane z = 1, each model with its analytic Jacobians.
+"""Camera models: how each reads its parameters, and its distortion on the plane z = 1 with analytic Jacobians.
 
-Every function takes ideal coordinates (n, 2) and its coefficients (k,), and returns the distorted coordinates
+A new model is a row of CAMERA_MODELS here and a branch of `solve.projection.projection_numba.distort_numba`; the tests
+find it in CAMERA_MODELS and ask `tests/geometry/test_camera.py` for parameters.
+
+Every distortion takes ideal coordinates (n, 2) and its coefficients (k,), and returns the distorted coordinates
 (n, 2), their derivative by the ideal coordinates (n, 2, 2) and by the coefficients (n, 2, k).
 
 Source:
@@ -9,6 +12,9 @@ Source:
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -99,3 +105,40 @@ def _tangential(uv: Float[np.ndarray, "n 2"], p: Float[np.ndarray, "2"]) -> Dist
     J_p[:, 0, 1] = r2 + 2 * u * u
     J_p[:, 1, 0] = r2 + 2 * v * v
     return value, J_uv, J_p
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """How the parameter vector of one model is read: focal length(s), principal point,"""
+
+    name: str
+    colmap_id: int
+    num_focal: int
+    """1: one focal length f for both axes; 2: fx, fy."""
+    coefficient_names: tuple[str, ...]
+    distort: Callable[[np.ndarray, np.ndarray], Distorted]
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names in the order of `Camera.params`."""
+        focal = ("f",) if self.num_focal == 1 else ("fx", "fy")
+        return (*focal, "cx", "cy", *self.coefficient_names)
+
+    @property
+    def num_params(self) -> int:
+        """Length of `Camera.params`."""
+        return self.num_focal + 2 + len(self.coefficient_names)
+
+
+CAMERA_MODELS: dict[str, CameraModel] = {
+    model.name: model
+    for model in (
+        CameraModel("SIMPLE_PINHOLE", 0, 1, (), no_distortion),
+        CameraModel("PINHOLE", 1, 2, (), no_distortion),
+        CameraModel("SIMPLE_RADIAL", 2, 1, ("k",), radial),
+        CameraModel("RADIAL", 3, 1, ("k1", "k2"), radial),
+        CameraModel("OPENCV", 4, 2, ("k1", "k2", "p1", "p2"), brown),
+        CameraModel("OPENCV_FISHEYE", 5, 2, ("k1", "k2", "k3", "k4"), fisheye),
+        CameraModel("FULL_OPENCV", 6, 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), rational),
+    )
+}
