@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.features.matching import MutualRatio, descriptor_distances, match_mutual
+from fieldstone.features.matching import MutualRatio, match_mutual
 from fieldstone.scene.features import Features
 
 
@@ -56,12 +56,6 @@ def test_exchanging_the_photos_exchanges_the_columns():
     backward = match_mutual(features_of(b), features_of(a), 0.8)
     assert len(forward) > 100
     np.testing.assert_array_equal(forward, backward[np.argsort(backward[:, 1])][:, ::-1])
-
-
-def test_distances_between_matched_descriptors():
-    a = np.array([[255] * 128, [0] * 128, [1] * 128], dtype=np.uint8)
-    matches = np.array([[0, 1], [2, 1]])
-    np.testing.assert_allclose(descriptor_distances(a, a, matches) ** 2, [255**2 * 128, 128])
 
 
 def test_no_features_no_matches():

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -44,6 +45,21 @@ def test_small_sets_are_matched_wholly_and_large_ones_where_they_overlap():
     assert overlapping <= set(pairs)
     assert len(pairs) < 0.25 * 60 * 59 / 2
     assert pairs == choose_pairs(photos, options, np.random.default_rng(1), threads=2)
+
+
+def test_the_chooser_is_the_one_that_is_named():
+    rng = np.random.default_rng(0)
+    photos = [*walk(14, rng), features_of(np.empty((0, 128), dtype=np.uint8))]
+    assert choose_pairs(photos, PairOptions(chooser="exhaustive"), rng) == list(combinations(range(14), 2))
+    expected = [(i, j) for i, j in combinations(range(14), 2) if j - i <= 3]
+    assert choose_pairs(photos, PairOptions(chooser="sequential", window=3), rng) == expected
+    similar = PairOptions(chooser="similar", num_candidates=4, num_preview=64)
+    automatic = replace(similar, chooser="automatic")
+    chosen = [choose_pairs(photos, options, np.random.default_rng(1)) for options in (similar, automatic)]
+    assert chosen[0] == chosen[1]
+    assert choose_pairs(photos[:5], automatic, rng) == exhaustive(photos[:5])
+    with pytest.raises(ValueError, match="window"):
+        PairOptions(window=0)
 
 
 def test_photos_without_features_get_no_pair():

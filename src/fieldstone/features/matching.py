@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int
 
 from fieldstone.features.nearest import TwoNearest
 from fieldstone.features.nearest_numba import two_nearest_numba
@@ -52,11 +52,3 @@ def mutual_and_distinct(from_a: TwoNearest, from_b: TwoNearest, max_ratio: float
     j = from_a.index[i]
     good = (from_b.index[j] == i) & from_a.distinct(max_ratio)[i] & from_b.distinct(max_ratio)[j]
     return np.stack([i[good], j[good]], axis=1).astype(np.int64)
-
-
-def descriptor_distances(
-    a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"], matches: Int[np.ndarray, "k 2"]
-) -> Float[np.ndarray, "k"]:
-    """Euclidean distance between the descriptors of each match."""
-    difference = a[matches[:, 0]].astype(np.float64) - b[matches[:, 1]]
-    return np.linalg.norm(difference, axis=1)

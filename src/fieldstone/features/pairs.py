@@ -1,4 +1,7 @@
-"""Which pairs of photos are worth matching."""
+"""Which pairs of photos are worth matching.
+
+A chooser is a function from `PhotosToPair` to pairs. A new one is written here and named in `CHOOSERS`.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,8 +22,6 @@ from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair
 
 logger = logging.getLogger(__name__)
-
-PairChooser = Callable[[Sequence[Features]], list[ImagePair]]
 
 
 def exhaustive(features: Sequence[Features]) -> list[ImagePair]:
@@ -55,10 +57,14 @@ def ordered(pairs: Iterable[tuple[int, int]]) -> list[ImagePair]:
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How many pairs are looked at, and how closely."""
+    """How pairs are chosen, how many of them, and how closely they are compared before."""
 
+    chooser: Literal["automatic", "exhaustive", "similar", "sequential"] = "automatic"
+    """automatic: all pairs of small sets, similar ones of large sets."""
     max_exhaustive: int = 12
-    """Up to this many photos all pairs are matched."""
+    """Up to this many photos, automatic takes all pairs."""
+    window: int = 10
+    """Photos that are at most so many places apart in their order make the pairs of `sequential`."""
     num_candidates: int = 25
     """Most similar photos of each photo, whose few largest features are matched to rank them."""
     num_indirect: int = 15
@@ -78,9 +84,26 @@ class PairOptions:
     vlad: VladOptions = field(default_factory=VladOptions)
 
     def __post_init__(self) -> None:
+        if self.window < 1:
+            raise ValueError(f"window must be at least 1, got {self.window}")
         counts = (self.num_candidates, self.num_preview, self.num_neighbors, self.num_certain)
         if min(counts) < 1 or self.num_trees < 0:
             raise ValueError(f"numbers of candidates, features and partners must be at least 1, got {counts}")
+
+
+@dataclass(frozen=True, eq=False)
+class PhotosToPair:
+    """What is known of photos before any two of them are matched."""
+
+    features: Sequence[Features]
+    """In the order of the photos' names."""
+    positions: Float[np.ndarray, "n 3"] | None
+    """In one Cartesian frame; rows with nan where there is no GPS."""
+    rng: np.random.Generator
+    threads: int
+
+
+PairChooser = Callable[[PhotosToPair, PairOptions], list[ImagePair]]
 
 
 def choose_pairs(
@@ -91,7 +114,20 @@ def choose_pairs(
     positions: Float[np.ndarray, "n 3"] | None = None,
     threads: int = 1,
 ) -> list[ImagePair]:
-    """All pairs of small sets; of large ones those that look alike, in number proportional to the photos.
+    """The pairs of the chooser that the options name; photos without features have none."""
+    pairs = CHOOSERS[options.chooser](PhotosToPair(features, positions, rng, threads), options)
+    return [pair for pair in pairs if all(len(features[k]) for k in pair)]
+
+
+def automatic_pairs(photos: PhotosToPair, options: PairOptions) -> list[ImagePair]:
+    """All pairs of small sets; of large ones those of `similar_pairs`."""
+    if len(photos.features) <= options.max_exhaustive:
+        return exhaustive(photos.features)
+    return similar_pairs(photos, options)
+
+
+def similar_pairs(photos: PhotosToPair, options: PairOptions) -> list[ImagePair]:
+    """Pairs of photos that are similar, in number proportional to the photos.
 
     Candidates by similarity as a whole (and by position, where it is known) are ranked by how many of their largest
     features match, and so are the partners of their good partners; every photo keeps its best partners, and spanning
@@ -100,15 +136,14 @@ def choose_pairs(
     Source:
         Matching a few large features first: `wu2013`, section 3.
     """
-    if len(features) <= options.max_exhaustive:
-        return exhaustive(features)
-    alike = similarities(features, options.vlad, rng)
+    features, positions, threads = photos.features, photos.positions, photos.threads
+    similarity = similarities(features, options.vlad, photos.rng)
     empty = np.array([len(f) == 0 for f in features])
-    alike[empty] = alike[:, empty] = -np.inf
-    np.fill_diagonal(alike, -np.inf)
-    candidates = set(most_similar(alike, options.num_candidates))
+    similarity[empty] = similarity[:, empty] = -np.inf
+    np.fill_diagonal(similarity, -np.inf)
+    candidates = set(most_similar(similarity, options.num_candidates))
     if positions is not None:
-        candidates |= {p for p in nearby(positions, options.num_candidates // 2) if np.isfinite(alike[p])}
+        candidates |= {p for p in nearby(positions, options.num_candidates // 2) if np.isfinite(similarity[p])}
     pairs = sorted(candidates)
     counts = preview_counts(features, pairs, options, threads=threads)
     indirect = partners_of_partners(
@@ -118,21 +153,29 @@ def choose_pairs(
     pairs = pairs + unseen
     counts = np.concatenate([counts, preview_counts(features, unseen, options, threads=threads)])
     # Similarity lies within (-1, 1): it decides between pairs with the same number of matches.
-    score = counts + 0.5 * np.array([alike[p] for p in pairs])
+    score = counts + 0.5 * np.array([similarity[p] for p in pairs])
     good = counts >= options.min_preview
     chosen = strongest(pairs, score, len(features), options.num_certain)
     chosen |= strongest(
         [p for p, g in zip(pairs, good, strict=True) if g], score[good], len(features), options.num_neighbors
     )
     chosen |= spanning_trees(pairs, score, len(features), options.num_trees)
-    logger.info("%d photos: %d pairs chosen of %d looked at", len(features), len(chosen), len(pairs))
+    logger.info("%d photos: %d pairs chosen of %d candidates", len(features), len(chosen), len(pairs))
     return sorted(chosen)
 
 
-def most_similar(alike: Float[np.ndarray, "n n"], count: int) -> list[ImagePair]:
+CHOOSERS: dict[str, PairChooser] = {
+    "automatic": automatic_pairs,
+    "exhaustive": lambda photos, options: exhaustive(photos.features),
+    "similar": similar_pairs,
+    "sequential": lambda photos, options: sequential(len(photos.features), options.window),
+}
+
+
+def most_similar(similarity: Float[np.ndarray, "n n"], count: int) -> list[ImagePair]:
     """Pairs of each photo with the `count` others of the largest finite similarity."""
-    best = np.argsort(-alike, axis=1, kind="stable")[:, :count]
-    return ordered((i, int(j)) for i, row in enumerate(best) for j in row if np.isfinite(alike[i, j]))
+    best = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
+    return ordered((i, int(j)) for i, row in enumerate(best) for j in row if np.isfinite(similarity[i, j]))
 
 
 def partners_of_partners(pairs: Sequence[ImagePair], num_photos: int, count: int) -> list[ImagePair]:

@@ -104,18 +104,8 @@ class Sift:
             size: (width, height) of the photo, in whose pixels the features are given.
             keep: As for the call.
         """
-        options = self.options
-        detector = cv2.SIFT.create(
-            # OpenCV does not know of `keep` when it chooses the strongest.
-            nfeatures=round(CANDIDATES * options.max_features) if keep is None else 0,
-            nOctaveLayers=3,
-            contrastThreshold=options.contrast_threshold,
-            edgeThreshold=options.edge_threshold,
-            sigma=1.6,
-            descriptorType=cv2.CV_8U,
-            # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
-            enable_precise_upscale=True,
-        )
+        # OpenCV does not know of `keep` when it chooses the strongest.
+        detector = self._detector(round(CANDIDATES * self.options.max_features) if keep is None else 0)
         # Each axis of the photo was reduced by its own, rounded, factor.
         zoom = np.array(size) / np.array([grey.shape[1], grey.shape[0]])
         # In one call, since a pyramid costs as much as thousands of descriptors.
@@ -131,7 +121,7 @@ class Sift:
         allowed = np.arange(len(xy)) if keep is None else np.flatnonzero(at_pixels(keep, xy * zoom))
         if not len(allowed):
             return _no_features()
-        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, options)]
+        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, self.options)]
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
         pixels = np.clip(xy[order] * zoom, 0.0, size)
         return Features(
@@ -140,6 +130,19 @@ class Sift:
             angle=angle[order],
             descriptors=root_sift(np.asarray(described, dtype=np.uint8)[order]),
             colors=at_pixels(image, pixels * (np.array([image.shape[1], image.shape[0]]) / np.array(size))),
+        )
+
+    def _detector(self, max_features: int) -> cv2.SIFT:
+        """OpenCV's detector for so many of the strongest features; 0: all."""
+        return cv2.SIFT.create(
+            nfeatures=max_features,
+            nOctaveLayers=3,
+            contrastThreshold=self.options.contrast_threshold,
+            edgeThreshold=self.options.edge_threshold,
+            sigma=1.6,
+            descriptorType=cv2.CV_8U,
+            # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
+            enable_precise_upscale=True,
         )
 
 

@@ -93,22 +93,41 @@ def select_camera_models(
             continue
         richer = adjust_globally(fitted, refinement, candidate, bundle=refinement.final, points=learners)
         new_errors = badness(richer)
-        gain = errors - new_errors
-        significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
-        clear = gain.mean() > options.min_gain * errors.mean() and significance > options.min_significance
-        accepted = bool(clear or (_num_free(candidate) < _num_free(best) and gain.mean() > 0.0))
-        rms_before_px, rms_after_px = (unit * float(np.sqrt(e.mean())) for e in (errors, new_errors))
-        trials.append(CalibrationTrial(step, rms_before_px, rms_after_px, significance, accepted))
-        logger.info(
-            "calibration %s %s: predicts to %.4f px instead of %.4f px, %.1f standard errors, %s",
-            step.model, "/".join(step.free), rms_after_px, rms_before_px, significance,
-            "accepted" if accepted else "refused",
-        )  # fmt: skip
-        if accepted:
+        simpler = _num_free(candidate) < _num_free(best)
+        trials.append(_judged(step, errors, new_errors, options, unit, simpler=simpler))
+        if trials[-1].accepted:
             best, fitted, errors, refused = candidate, richer, new_errors, 0
         else:
             refused += 1
     return best, trials
+
+
+def _judged(
+    step: CalibrationStep,
+    before: Float[np.ndarray, "k"],
+    after: Float[np.ndarray, "k"],
+    options: SelfCalibrationOptions,
+    unit: float,
+    *,
+    simpler: bool,
+) -> CalibrationTrial:
+    """Whether a step is believed, by the robust squared errors of the same predictions before and after it.
+
+    Args:
+        unit: Pixels of the photos per unit of the errors' roots.
+        simpler: It has fewer parameters, and need only predict as well.
+    """
+    gain = before - after
+    significance = float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-300))
+    clear = gain.mean() > options.min_gain * before.mean() and significance > options.min_significance
+    accepted = bool(clear or (simpler and gain.mean() > 0.0))
+    rms_before_px, rms_after_px = (unit * float(np.sqrt(errors.mean())) for errors in (before, after))
+    logger.info(
+        "calibration %s %s: predicts to %.4f px instead of %.4f px, %.1f standard errors, %s",
+        step.model, "/".join(step.free), rms_after_px, rms_before_px, significance,
+        "accepted" if accepted else "refused",
+    )  # fmt: skip
+    return CalibrationTrial(step, rms_before_px, rms_after_px, significance, accepted)
 
 
 def _num_free(calibration: Sequence[CalibrationStep | None]) -> int:
@@ -152,10 +171,10 @@ def prediction_errors(
     return np.nan_to_num(out, nan=np.inf) / model.pixel_scale[view]
 
 
-def _held_out(model: WorkingModel, share: float, rng: np.random.Generator) -> Bool[np.ndarray, "t"]:
+def _held_out(model: WorkingModel, ratio: float, rng: np.random.Generator) -> Bool[np.ndarray, "t"]:
     """Tracks of at least three used observations, drawn at random."""
     lengths = np.bincount(model.tracks.point[model.used_observations()], minlength=len(model.xyz))
-    return (rng.random(len(model.xyz)) < share) & (lengths >= 3)
+    return (rng.random(len(model.xyz)) < ratio) & (lengths >= 3)
 
 
 def _leave_one_out(point: Int[np.ndarray, "u"]) -> _Predictions:

@@ -85,7 +85,7 @@ def map_textbook(
     """Camera poses and points from matches between photos of known calibration.
 
     Returns:
-        The largest model that grows from the best initial pair. It has no registered photo, and no `initial_pair`,
+        The model that the best initial pair starts. It has no registered photo, and no `initial_pair`,
         if no pair of photos gives a start.
     """
     graph = estimate_essential_matrices(graph, cameras, camera_of_image, options, seed)
@@ -102,6 +102,23 @@ def map_textbook(
     model, records = triangulate_new_points(model, graph.names, (i, j), options.robust_scale_px)
     model, dropped = drop_outliers(model, "start", options.max_error_px, options.min_angle_deg)
     drops += dropped
+    model, failures, more_records, dropped = register_all(model, graph, options, seed)
+    records, drops = records + more_records, drops + dropped
+    records += record_views(model, graph.names, "before BA")
+    before = to_reconstruction(model, graph)
+    model, dropped = refine_globally(model, options)
+    records += record_views(model, graph.names, "after BA")
+    verdicts = _verdicts(graph, model, failures)
+    reconstruction = to_reconstruction(model, graph)
+    return MappingRun(reconstruction, graph, initial, tuple(records), tuple(drops + dropped), before, verdicts)
+
+
+def register_all(
+    model: WorkingModel, graph: MatchGraph, options: TextbookOptions, seed: int
+) -> tuple[WorkingModel, dict[int, str], list[StageRecord], list[Drop]]:
+    """Photo after photo, until none that is left can be registered; the failures say why not."""
+    records: list[StageRecord] = []
+    drops: list[Drop] = []
     failures: dict[int, str] = {}
     while (view := view_with_most_points(model, failures)) is not None:
         if not failures:  # the model has grown since the last adjustment
@@ -118,14 +135,7 @@ def map_textbook(
         records += stage_records
         model, dropped = drop_outliers(model, f"after {graph.names[view]}", options.max_error_px, options.min_angle_deg)
         drops += dropped
-
-    records += record_views(model, graph.names, "before BA")
-    before = to_reconstruction(model, graph)
-    model, dropped = refine_globally(model, options)
-    records += record_views(model, graph.names, "after BA")
-    verdicts = _verdicts(graph, model, failures)
-    reconstruction = to_reconstruction(model, graph)
-    return MappingRun(reconstruction, graph, initial, tuple(records), tuple(drops + dropped), before, verdicts)
+    return model, failures, records, drops
 
 
 def estimate_essential_matrices(

@@ -47,7 +47,7 @@ def map_incremental(
     store: CheckpointStore | None = None,
     on_progress: OnProgress = silent,
 ) -> list[SubModel]:
-    """Every sub-model of the graph that grows from a pair, the one with most photos first.
+    """Every sub-model of the graph that a pair can start, the one with most photos first.
 
     Args:
         graph: Verified: `two_views` hold the geometry and inliers of every pair.
@@ -181,7 +181,9 @@ def take_in(
 def needs_global_adjustment(state: RegistrationState, options: IncrementalOptions) -> bool:
     """Whether the model with one more photo is small, or has grown by a factor since its last global adjustment."""
     size = state.model.num_registered + 1
-    return size <= options.refinement.always_global or size >= options.refinement.growth * state.num_at_global
+    return (
+        size <= options.refinement.always_global or size >= options.refinement.global_growth_ratio * state.num_at_global
+    )
 
 
 def adjusted_with(

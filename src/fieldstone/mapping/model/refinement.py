@@ -1,4 +1,4 @@
-"""Bundle adjustment of a growing model: of everything, around one view, and until nothing changes."""
+"""Bundle adjustment of a working model: of everything, around one view, and until nothing changes."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ class RefinementOptions:
     """When to adjust what, and how exactly."""
 
     tracks_per_view: int = 600
-    """Points per photo that carry the adjustments while a model grows; the last ones use all."""
+    """Points per photo that carry the adjustments between registrations; the last ones use all."""
     always_global: int = 16
     """Up to so many photos every adjustment is of the whole model."""
-    growth: float = 1.15
+    global_growth_ratio: float = 1.15
     """Beyond, the whole model is adjusted when it has grown by this factor since the last time."""
     neighbors: int = 8
     """Photos that are adjusted together with a new one, those that share most points with it."""
-    growing: BundleOptions = field(
+    intermediate: BundleOptions = field(
         default_factory=lambda: BundleOptions(
             loss="soft_l1", max_iterations=10, relative_tolerance=1e-4, keep_gauge=True
         )
     )
-    """Adjustments while the model grows."""
+    """Adjustments between registrations."""
     final: BundleOptions = field(
         default_factory=lambda: BundleOptions(
             loss="cauchy", max_iterations=50, relative_tolerance=3e-5, keep_gauge=True
@@ -74,7 +74,7 @@ def adjust_globally(
 ) -> WorkingModel:
     """All poses, the points that cover them (or those of a mask), and the intrinsics that may move."""
     points = covering_tracks(model, options.tracks_per_view) if points is None else points
-    return _solve(model, points, model.registered, calibration, options, bundle or options.growing)
+    return _solve(model, points, model.registered, calibration, options, bundle or options.intermediate)
 
 
 def adjust_locally(
@@ -93,7 +93,7 @@ def adjust_locally(
     touched[model.tracks.point[rows[free[model.tracks.view[rows]]]]] = True
     points = covering_tracks(model, options.tracks_per_view, touched)
     fixed: Calibration = (None,) * len(model.cameras)
-    return _solve(model, points, free, fixed, options, options.growing), touched
+    return _solve(model, points, free, fixed, options, options.intermediate), touched
 
 
 def refine_until_stable(

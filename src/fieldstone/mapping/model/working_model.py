@@ -1,4 +1,4 @@
-"""The model while it grows: poses that may be missing, points that may be nan, observations that may be dropped."""
+"""The model in the making: poses that may be missing, points that may be nan, observations that may be dropped."""
 
 from __future__ import annotations
 

@@ -64,38 +64,50 @@ def detect(
     """
     extractor = Sift(options.sift)
     masks = {} if options.masks is None else find_masks(options.masks, paths)
+    progress = StageProgress(on_progress, "finding features", len(paths))
 
     def one(path: Path) -> DetectedPhoto | PhotoProblem:
-        mask = masks.get(path)
-        bad_name = name_problem(path.name)
-        if bad_name is not None:
-            return PhotoProblem(path, f"{bad_name}; rename it", "not used")
-        try:
-            hashes = [file_hash(path), None if mask is None else file_hash(mask)]
-            key = key_of(STAGE, code_version(), cv2.__version__, hashes, options.sift)
-            unit = workspace.find(STAGE, key)
-            if unit is not None:
-                return DetectedPhoto(read_photo_info(path), Features(**unit.arrays), key, mask=mask, **unit.facts)
-            info = read_photo_info(path)
-        except InputError as error:
-            return _unusable(path, error)
-        keep = None if mask is None else read_mask(mask, info)
-        try:
-            features, sharp = _coarse_to_fine(extractor, info, keep)
-        except InputError as error:
-            return _unusable(path, error)
-        facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
-        arrays = {f.name: getattr(features, f.name) for f in fields(Features)}
-        workspace.keep(STAGE, key, Unit(arrays, facts))
-        return DetectedPhoto(info, features, key, mask=mask, **facts)
+        return _detected(path, masks.get(path), extractor, workspace)
 
-    progress = StageProgress(on_progress, "finding features", len(paths))
     # A photo for each thread, until there are fewer photos than threads.
     together = len(paths) - len(paths) % options.threads
     with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
         results = list(progress.each(pool.map(one, paths[:together])))
     with opencv_threads(options.threads):
         results += list(progress.each(map(one, paths[together:])))
+    photos, problems = _without_copies(results)
+    workspace.forget_others(STAGE, [photo.key for photo in photos])
+    check_polarity([photo.kept for photo in photos if photo.info.path in masks])
+    return photos, problems
+
+
+def _detected(path: Path, mask: Path | None, extractor: Sift, workspace: Workspace) -> DetectedPhoto | PhotoProblem:
+    """Features of one photo, found in the workspace or in its pixels; or why it is not used."""
+    bad_name = name_problem(path.name)
+    if bad_name is not None:
+        return PhotoProblem(path, f"{bad_name}; rename it", "not used")
+    try:
+        hashes = [file_hash(path), None if mask is None else file_hash(mask)]
+        key = key_of(STAGE, code_version(), cv2.__version__, hashes, extractor.options)
+        unit, info = workspace.find(STAGE, key), read_photo_info(path)
+    except InputError as error:
+        return _unusable(path, error)
+    if unit is not None:
+        return DetectedPhoto(info, Features(**unit.arrays), key, mask=mask, **unit.facts)
+    keep = None if mask is None else read_mask(mask, info)
+    try:
+        features, sharp = _coarse_to_fine(extractor, info, keep)
+    except InputError as error:
+        return _unusable(path, error)
+    facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
+    workspace.keep(STAGE, key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
+    return DetectedPhoto(info, features, key, mask=mask, **facts)
+
+
+def _without_copies(
+    results: Sequence[DetectedPhoto | PhotoProblem],
+) -> tuple[list[DetectedPhoto], list[PhotoProblem]]:
+    """The first of all photos with the same content, and the problems, to which its copies are added."""
     problems = [result for result in results if isinstance(result, PhotoProblem)]
     first: dict[str, DetectedPhoto] = {}
     for photo in (result for result in results if isinstance(result, DetectedPhoto)):
@@ -104,10 +116,7 @@ def detect(
             problems.append(PhotoProblem(photo.info.path, reason, "not used"))
         else:
             first[photo.key] = photo
-    seen = list(first.values())
-    workspace.forget_others(STAGE, [photo.key for photo in seen])
-    check_polarity([photo.kept for photo in seen if photo.info.path in masks])
-    return seen, problems
+    return list(first.values()), problems
 
 
 def _unusable(path: Path, error: InputError) -> PhotoProblem:

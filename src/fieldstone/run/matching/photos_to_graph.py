@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Int
 
 from fieldstone.errors import InputError
 from fieldstone.features.pairs import choose_pairs
@@ -19,6 +19,7 @@ from fieldstone.io.course.matching_txt import read_course_folder
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.progress import OnProgress, silent
+from fieldstone.report.figures import PhotoByName
 from fieldstone.report.raster import DRAWN_PX
 from fieldstone.run.matching.detection import DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
@@ -27,9 +28,6 @@ from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positio
 from fieldstone.scene.match_graph import MatchGraph
 
 logger = logging.getLogger(__name__)
-
-PhotoByName = Callable[[str], UInt8[np.ndarray, "h w 3"] | None]
-"""Decodes the photo of that name, large enough for figures; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
