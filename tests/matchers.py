@@ -46,6 +46,16 @@ def assert_reconstruction_near(
     )
 
 
+def assert_draws(errors: list[float], *, below: float, fraction: float = 1.0) -> None:
+    """At least this fraction of seeded draws has an error below the limit; the message names those that have not."""
+    found = np.asarray(errors, dtype=np.float64)
+    bad = np.flatnonzero(~(found < below))
+    allowed = int(np.floor((1.0 - fraction) * len(found) + 1e-9))
+    assert len(found), "no draw at all"
+    worst = ", ".join(f"draw {k}: {found[k]:.3g}" for k in bad[:10])
+    assert len(bad) <= allowed, f"{len(bad)} of {len(found)} draws not below {below:g} (allowed {allowed}): {worst}"
+
+
 def check_jacobian(
     value: Callable[[np.ndarray], np.ndarray],
     jacobian: np.ndarray,
