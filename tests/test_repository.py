@@ -41,6 +41,14 @@ def test_every_cited_paper_is_in_the_references():
     assert cited <= keys, f"not in docs/references.bib: {sorted(cited - keys)}"
 
 
+def test_every_source_in_the_glossary_is_in_the_references():
+    keys = re.findall(r"@\w+\{([^,]+),", (ROOT / "docs" / "references.bib").read_text())
+    assert len(keys) == len(set(keys)), "a key is there twice"
+    cited = set(re.findall(r"`([a-z]+\d{4}[a-z]?)`", (ROOT / "docs" / "glossary.md").read_text()))
+    assert cited
+    assert cited <= set(keys), f"not in docs/references.bib: {sorted(cited - set(keys))}"
+
+
 def test_no_data_file_is_large():
     for path in (ROOT / "tests").rglob("*"):
         assert not path.is_file() or path.stat().st_size < 1_000_000, path
