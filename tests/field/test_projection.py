@@ -9,8 +9,7 @@ from fieldstone.field.base.projection import (
     unproject_points,
 )
 from fieldstone.field.base.ray_dataset import PosedImage
-from fieldstone.field.base.space import projective_space
-from fieldstone.field.base.space_numba import marched_ray_numba
+from fieldstone.field.base.space_numba import project_ray_numba
 from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import exp
 from fieldstone.scene.rays import rays_from_view
@@ -76,7 +75,7 @@ def test_kernel_matches_reference(space):
     start, expected, length = project_rays(projection, rays.origins, directions)
     o, d = rays.origins.astype(np.float32).reshape(-1), directions.astype(np.float32).reshape(-1)
     for ray in range(len(rays)):
-        marched_ray_numba(projective_space(projection), o, d, ray)
+        project_ray_numba(projection, o, d, ray)
     np.testing.assert_allclose(d.reshape(-1, 3), expected, atol=1e-5)
     ahead = length > 0
     assert not ahead[0]

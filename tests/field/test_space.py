@@ -16,7 +16,7 @@ from fieldstone.field.base.space import (
     projective_space,
     stretch,
 )
-from fieldstone.field.base.space_numba import contract_numba, marched_ray_numba
+from fieldstone.field.base.space_numba import contract_numba
 from fieldstone.geometry.rotation import exp
 
 SIDE = 1.25
@@ -120,19 +120,6 @@ def test_contraction_of_the_kernels_is_that_of_the_reference(kernel):
     found = np.array([kernel(*(p + 2 * SIDE).astype(np.float32), half) for p in points])
     np.testing.assert_allclose(found[:, :3] - 2 * SIDE, grid_from_normalized(space, points), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(found[:, 3] ** 2, stretch(space, points), rtol=1e-4)
-
-
-@all_spaces
-def test_marched_rays_of_the_kernels_are_those_of_the_reference(space):
-    points = points_ahead(40)
-    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    origins = np.full_like(points, 0.05)
-    start, ahead, _ = marched_rays(space, origins, directions)
-    o, d = origins.astype(np.float32).reshape(-1), directions.astype(np.float32).reshape(-1)
-    for ray in range(len(points)):
-        marched_ray_numba(space, o, d, ray)
-    np.testing.assert_allclose(o.reshape(-1, 3), start, atol=1e-5)
-    np.testing.assert_allclose(d.reshape(-1, 3), ahead, atol=1e-5)
 
 
 def test_torch_contracts_as_the_reference_does():

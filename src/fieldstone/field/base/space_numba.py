@@ -7,8 +7,6 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.field.base.space import PROJECTIVE
-
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
@@ -28,16 +26,8 @@ def contract_numba(x, y, z, half_side):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def marched_ray_numba(space, origins, directions, ray):
-    """`space.marched_rays` of one ray, in place, in flat arrays."""
-    if space.kind == PROJECTIVE:
-        _project_ray(space.projection, origins, directions, ray)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def _project_ray(projection, origins, directions, ray):
-    """`projection.project_rays` of one ray; what does not look ahead points out of the box."""
+def project_ray_numba(projection, origins, directions, ray):
+    """`projection.project_rays` of one ray, in place; what does not look ahead points out of the box."""
     o, d = np.empty(3, np.float32), np.empty(3, np.float32)
     for a in range(3):
         o[a], d[a] = 0, 0

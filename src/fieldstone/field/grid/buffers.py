@@ -48,6 +48,8 @@ class Work(NamedTuple):
     d_log_density: np.ndarray
     d_weight: np.ndarray
     d_gain: np.ndarray
+    d_shown: np.ndarray
+    """By the colour of a ray before its gain."""
 
 
 class Chunk(NamedTuple):
@@ -112,6 +114,7 @@ def work_buffers(num_rays: int, num_samples: int) -> Work:
         d_log_density=_floats(num_samples),
         d_weight=_floats(num_samples),
         d_gain=_floats(3 * num_rays),
+        d_shown=_floats(3 * num_rays),
     )
 
 

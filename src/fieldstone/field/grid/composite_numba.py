@@ -49,51 +49,64 @@ def composite_backward(samples, rays, work, num_rays, terms, scale):
     Source:
         `max1995`, section 3, differentiated.
     """
-    background, target, gain, rgb, d_gain = rays.background, rays.target, rays.gain, work.rgb, work.d_gain
-    loss = 0.0
-    for ray in range(num_rays):
-        start, end = rays.first[ray], rays.first[ray + 1]
-        passed = rays.end_transmittance[ray]
-        g0, g1, g2 = passed * background[ray * 3], passed * background[ray * 3 + 1], passed * background[ray * 3 + 2]
-        for i in range(start, end):
-            weight = at(samples.transmittance, i) * at(samples.alpha, i)
-            g0 += weight * at(rgb, i * 3)
-            g1 += weight * at(rgb, i * 3 + 1)
-            g2 += weight * at(rgb, i * 3 + 2)
-        r, g, b = gain[ray * 3], gain[ray * 3 + 1], gain[ray * 3 + 2]
-        shown0, shown1, shown2 = r * g0, g * g1, b * g2
-        g0, g1, g2 = shown0 - target[ray * 3], shown1 - target[ray * 3 + 1], shown2 - target[ray * 3 + 2]
-        loss += g0 * g0 + g1 * g1 + g2 * g2
-        d_gain[ray * 3], d_gain[ray * 3 + 1] = g0 * shown0 * scale, g1 * shown1 * scale
-        d_gain[ray * 3 + 2] = g2 * shown2 * scale
-        g0, g1, g2 = g0 * r * scale, g1 * g * scale, g2 * b * scale
-        behind = passed * (background[ray * 3] * g0 + background[ray * 3 + 1] * g1 + background[ray * 3 + 2] * g2)
-        behind -= np.float32(0.5) * scale * terms.sparsity * passed
-        bare = target[ray * 3] == background[ray * 3] and target[ray * 3 + 1] == background[ray * 3 + 1]
-        bare = bare and target[ray * 3 + 2] == background[ray * 3 + 2]
-        thinner = np.float32(0.5) * scale * terms.emptiness if bare else np.float32(0)
-        _samples_backward(samples, work, start, end, g0, g1, g2, behind, thinner, scale)
+    loss = _rays_backward(samples, rays, work, num_rays, scale)
+    _samples_backward(samples, rays, work, num_rays, terms, scale)
     return loss
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _samples_backward(samples, work, start, end, g0, g1, g2, behind, thinner, scale):
-    """From the last sample of a ray to the first.
+def _rays_backward(samples, rays, work, num_rays, scale):
+    """Squared colour errors, and the gradients by the colour C and the gain of each ray."""
+    background, target, gain = rays.background, rays.target, rays.gain
+    rgb, d_gain, d_shown = work.rgb, work.d_gain, work.d_shown
+    loss = 0.0
+    for ray in range(num_rays):
+        passed = rays.end_transmittance[ray]
+        c0, c1, c2 = passed * background[ray * 3], passed * background[ray * 3 + 1], passed * background[ray * 3 + 2]
+        for i in range(rays.first[ray], rays.first[ray + 1]):
+            weight = at(samples.transmittance, i) * at(samples.alpha, i)
+            c0 += weight * at(rgb, i * 3)
+            c1 += weight * at(rgb, i * 3 + 1)
+            c2 += weight * at(rgb, i * 3 + 2)
+        r, g, b = gain[ray * 3], gain[ray * 3 + 1], gain[ray * 3 + 2]
+        shown0, shown1, shown2 = r * c0, g * c1, b * c2
+        e0, e1, e2 = shown0 - target[ray * 3], shown1 - target[ray * 3 + 1], shown2 - target[ray * 3 + 2]
+        loss += e0 * e0 + e1 * e1 + e2 * e2
+        d_gain[ray * 3], d_gain[ray * 3 + 1] = e0 * shown0 * scale, e1 * shown1 * scale
+        d_gain[ray * 3 + 2] = e2 * shown2 * scale
+        d_shown[ray * 3], d_shown[ray * 3 + 1] = e0 * r * scale, e1 * g * scale
+        d_shown[ray * 3 + 2] = e2 * b * scale
+    return loss
 
-    With g = gain (gain C - target) and w_i = T_i alpha_i:
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _samples_backward(samples, rays, work, num_rays, terms, scale):
+    """Gradients by the colour and the log density of each sample, from the last one of a ray to the first.
+
+    With g the gradient by C and w_i = T_i alpha_i:
     dC / dtau_i = T_(i+1) c_i - sum_{j>i} w_j c_j - T_end background,  dtau / dlog_density = tau.
-    behind: g times what is seen behind the samples that were done. thinner: what emptiness says of the ray.
     """
-    one, rgb, d_color = np.float32(1), work.rgb, work.d_color
-    for i in range(end - 1, start - 1, -1):
-        transmittance, alpha = at(samples.transmittance, i), at(samples.alpha, i)
-        weight = transmittance * alpha
-        r, g, b = at(rgb, i * 3), at(rgb, i * 3 + 1), at(rgb, i * 3 + 2)
-        of_sample = r * g0 + g * g1 + b * g2 + scale * at(work.d_weight, i)
-        tau = at(samples.tau, i)
-        work.d_log_density[i] = (transmittance * (one - alpha) * of_sample - behind + thinner / (one + tau)) * tau
-        behind += weight * of_sample
-        d_color[i * 3] = weight * g0 * r * (one - r)
-        d_color[i * 3 + 1] = weight * g1 * g * (one - g)
-        d_color[i * 3 + 2] = weight * g2 * b * (one - b)
+    one, half = np.float32(1), np.float32(0.5)
+    background, target, rgb, d_shown = rays.background, rays.target, work.rgb, work.d_shown
+    d_color, d_log_density, d_weight = work.d_color, work.d_log_density, work.d_weight
+    for ray in range(num_rays):
+        b0, b1, b2 = background[ray * 3], background[ray * 3 + 1], background[ray * 3 + 2]
+        g0, g1, g2 = d_shown[ray * 3], d_shown[ray * 3 + 1], d_shown[ray * 3 + 2]
+        passed = rays.end_transmittance[ray]
+        behind = passed * (b0 * g0 + b1 * g1 + b2 * g2)  # g times what is seen behind the samples that were done
+        behind -= half * scale * terms.sparsity * passed
+        bare = target[ray * 3] == b0 and target[ray * 3 + 1] == b1 and target[ray * 3 + 2] == b2
+        thinner = half * scale * terms.emptiness if bare else np.float32(0)
+        for i in range(rays.first[ray + 1] - 1, rays.first[ray] - 1, -1):
+            transmittance, alpha = at(samples.transmittance, i), at(samples.alpha, i)
+            weight = transmittance * alpha
+            r, g, b = at(rgb, i * 3), at(rgb, i * 3 + 1), at(rgb, i * 3 + 2)
+            of_sample = r * g0 + g * g1 + b * g2 + scale * at(d_weight, i)
+            tau = at(samples.tau, i)
+            d_log_density[i] = (transmittance * (one - alpha) * of_sample - behind + thinner / (one + tau)) * tau
+            behind += weight * of_sample
+            d_color[i * 3] = weight * g0 * r * (one - r)
+            d_color[i * 3 + 1] = weight * g1 * g * (one - g)
+            d_color[i * 3 + 2] = weight * g2 * b * (one - b)

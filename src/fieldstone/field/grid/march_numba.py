@@ -105,13 +105,14 @@ def steps_out_of_cell(box, step, distance, i, j, k, x, y, z, dx, dy, dz):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @no_type_check
-def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capacity, width, out, queue):
+def march_ray(
+    grid, box, march, contracted, half_side, origins, directions, ray, jitter, far, n, capacity, width, out, queue
+):
     """Append the samples of one ray behind the n there are; returns (n, transmittance, density evaluations).
 
     jitter: fraction of a step before the first sample. far: where the ray ends at the latest.
     """
     zero, one = np.float32(0), np.float32(1)
-    contracted = box.space.kind == CONTRACTED
     dx, dy, dz = at(directions, ray * 3), at(directions, ray * 3 + 1), at(directions, ray * 3 + 2)
     ex, ey, ez = at(box.extent, 0), at(box.extent, 1), at(box.extent, 2)
     ox, oy, oz = (
@@ -137,7 +138,7 @@ def march_ray(grid, box, march, origins, directions, ray, jitter, far, n, capaci
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             stride = march.step
             if contracted:
-                x, y, z, reach = contract_numba(x, y, z, box.space.half_side)
+                x, y, z, reach = contract_numba(x, y, z, half_side)
                 stride = march.step * reach * reach
             x, y, z = min(max(x, zero), ex), min(max(y, zero), ey), min(max(z, zero), ez)
             i, j, k = (
@@ -191,11 +192,26 @@ def march_rays(grid, box, march, origins, directions, jitter, far, num_rays, wid
     """
     capacity = out.alpha.shape[0]
     queue = np.empty(QUEUE * 4, np.float32)
+    contracted, half_side = box.space.kind == CONTRACTED, box.space.half_side
     n, evaluations, ray = 0, 0, 0
     while ray < num_rays:
         first[ray] = n
         n, end_transmittance[ray], steps = march_ray(
-            grid, box, march, origins, directions, ray, jitter[ray], far, n, capacity, width, out, queue
+            grid,
+            box,
+            march,
+            contracted,
+            half_side,
+            origins,
+            directions,
+            ray,
+            jitter[ray],
+            far,
+            n,
+            capacity,
+            width,
+            out,
+            queue,
         )
         if n >= capacity and ray > 0:
             n = first[ray]

@@ -7,7 +7,8 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from fieldstone.field.base.space_numba import marched_ray_numba
+from fieldstone.field.base.space import PROJECTIVE
+from fieldstone.field.base.space_numba import project_ray_numba
 from fieldstone.field.grid.composite_numba import composite_backward
 from fieldstone.field.grid.decoder import Decoder
 from fieldstone.field.grid.decoder_numba import decode_backward, decode_directions, decode_numba
@@ -91,6 +92,7 @@ def draw_rays(table, space, gains, start, count, seed, background, rays, at):
     They are put to place `at` and after. gains: (v, 3) flat, of each photo.
     """
     scale = np.float32(1.0 / 255.0)
+    projective, projection = space.kind == PROJECTIVE, space.projection
     for k in range(count):
         n = at + k
         ahead = drawn_row(table, start + k + AHEAD)
@@ -116,7 +118,8 @@ def draw_rays(table, space, gains, start, count, seed, background, rays, at):
         rays.depth_row[n] = row
         rays.free_distance[n] = table.free_distance[row]
         rays.jitter[n] = random_uniform(seed, start + k)
-        marched_ray_numba(space, rays.origins, rays.directions, n)
+        if projective:
+            project_ray_numba(projection, rays.origins, rays.directions, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
