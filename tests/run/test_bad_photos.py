@@ -19,6 +19,7 @@ from fieldstone.features.sift import SiftOptions
 from fieldstone.io.files.cache import Workspace
 from fieldstone.io.images.exif import FOCAL_LENGTH_35MM
 from fieldstone.io.models.colmap import read_colmap
+from fieldstone.progress import Progress
 from fieldstone.run.matching.detection import sharpness
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import match_photos
@@ -44,6 +45,19 @@ def photos(house_photos, tmp_path) -> Path:
 
 def matched(photos: Path, options: MatchingOptions = OPTIONS):
     return match_photos(photos, options, 0, Workspace())
+
+
+def test_progress_counts_photos_and_pairs_also_of_an_earlier_run(photos, tmp_path):
+    workspace = Workspace(tmp_path / "units")
+    for _ in range(2):
+        events: list[Progress] = []
+        found = match_photos(photos, OPTIONS, 0, workspace, events.append)
+        assert list(dict.fromkeys(e.stage for e in events)) == ["finding features", "matching", "verifying pairs"]
+        num_files = len(found.graph.names) + len(found.problems)
+        for stage, total in (("finding features", num_files), ("verifying pairs", len(found.graph.matches))):
+            done = [e.done for e in events if e.stage == stage]
+            assert (done[0], done[-1]) == (0, total)
+            assert done == sorted(done)
 
 
 def test_no_features_under_masks(photos, tmp_path):

@@ -20,6 +20,7 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.triangulation import choose_by_cheirality, triangulate_linear, triangulation_angles
 from fieldstone.mapping.model.outliers import drop_outliers, recall_observations, triangulate_new_points
 from fieldstone.mapping.model.working_model import WorkingModel, record_views, reprojections, to_reconstruction
+from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.scene.mapping_run import Drop, InitialPair, MappingRun, StageRecord
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.scene.tracks import build_tracks
@@ -81,6 +82,7 @@ def map_textbook(
     camera_of_image: Int[np.ndarray, "n"],
     options: TextbookOptions,
     seed: int,
+    on_progress: OnProgress = silent,
 ) -> MappingRun:
     """Camera poses and points from matches between photos of known calibration.
 
@@ -102,7 +104,7 @@ def map_textbook(
     model, records = triangulate_new_points(model, graph.names, (i, j), options.robust_scale_px)
     model, dropped = drop_outliers(model, "start", options.max_error_px, options.min_angle_deg)
     drops += dropped
-    model, failures, more_records, dropped = register_all(model, graph, options, seed)
+    model, failures, more_records, dropped = register_all(model, graph, options, seed, on_progress)
     records, drops = records + more_records, drops + dropped
     records += record_views(model, graph.names, "before BA")
     before = to_reconstruction(model, graph)
@@ -114,9 +116,11 @@ def map_textbook(
 
 
 def register_all(
-    model: WorkingModel, graph: MatchGraph, options: TextbookOptions, seed: int
+    model: WorkingModel, graph: MatchGraph, options: TextbookOptions, seed: int, on_progress: OnProgress = silent
 ) -> tuple[WorkingModel, dict[int, str], list[StageRecord], list[Drop]]:
     """Photo after photo, until none that is left can be registered; the failures say why not."""
+    progress = StageProgress(on_progress, "registering photos", graph.num_images)
+    progress.at(model.num_registered)
     records: list[StageRecord] = []
     drops: list[Drop] = []
     failures: dict[int, str] = {}
@@ -131,6 +135,7 @@ def register_all(
         logger.info("registered %s: %s", graph.names[view], reason)
         failures.clear()  # a larger model may see what a smaller one could not
         model = model.with_pose(view, pose)
+        progress.at(model.num_registered)
         model, stage_records = triangulate_new_points(model, graph.names, (view,), options.robust_scale_px)
         records += stage_records
         model, dropped = drop_outliers(model, f"after {graph.names[view]}", options.max_error_px, options.min_angle_deg)

@@ -64,25 +64,27 @@ def map_given_matches(
     it knows of one place only.
     """
     if mapper == "textbook":
-        return mapper, map_with_textbook(matched, textbook, seed)
+        return mapper, map_with_textbook(matched, textbook, seed, on_progress)
     graph, cameras, camera_of_image = matched.graph, matched.cameras, matched.camera_of_image
     graph = verify_pairs(graph, cameras, camera_of_image, matching.two_view, seed, matching.threads, on_progress)
     found = disambiguate(graph, cameras, camera_of_image, options.disambiguation)
     if mapper == "auto" and not found.left_out.any():
-        return "textbook", map_with_textbook(matched, textbook, seed)
+        return "textbook", map_with_textbook(matched, textbook, seed, on_progress)
     verified = replace(matched, graph=graph)
     run = map_disambiguated(verified, found, matching, options, seed, store, on_progress)
     return options.mapper, run
 
 
-def map_with_textbook(matched: MatchedPhotos, options: TextbookOptions, seed: int) -> MappingRun:
+def map_with_textbook(
+    matched: MatchedPhotos, options: TextbookOptions, seed: int, on_progress: OnProgress = silent
+) -> MappingRun:
     """The textbook mapper on the same matches; focal lengths are refined where they are not exact.
 
     It has one threshold for all photos: that of the largest.
     """
     scale = float(matched.graph.scale_of_image.max(initial=1.0))
     textbook = for_pixel_scale(replace(options, refine_focal=not matched.known.all()), scale)
-    return map_textbook(matched.graph, matched.cameras, matched.camera_of_image, textbook, seed)
+    return map_textbook(matched.graph, matched.cameras, matched.camera_of_image, textbook, seed, on_progress)
 
 
 def map_disambiguated(

@@ -138,7 +138,7 @@ def run_mapper(
             photos, options.mapper, options.matching(), mapping, textbook, seed, checkpoints, on_progress
         )
     if options.mapper == "textbook":
-        return "textbook", map_with_textbook(photos, textbook, seed)
+        return "textbook", map_with_textbook(photos, textbook, seed, on_progress)
     return mapping.mapper, map_photos(photos, options.matching(), mapping, seed, checkpoints, on_progress)
 
 
