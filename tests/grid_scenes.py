@@ -3,7 +3,6 @@
 import numpy as np
 
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.decoder import decoder_width, initial_decoder
 from fieldstone.field.grid.field import GridField
@@ -11,8 +10,9 @@ from fieldstone.field.grid.layout import grid_layout
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.field.grid_training.plan import GridPlan, Schedule
 from fieldstone.geometry.camera import Camera
-from fieldstone.geometry.rigid3 import look_at
+from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.sim3 import Sim3
+from fieldstone.scene.photos import DecodedPhotos, posed_photos
 from fieldstone.scene.rays import rays_from_view
 
 FRAME = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
@@ -20,26 +20,37 @@ CAMERA = Camera("SIMPLE_PINHOLE", 40, 32, np.array([45.0, 20.0, 16.0]))
 RADIUS = 0.8
 
 
-def ball_images(n=8, camera=CAMERA, heights=(0.3, 1.6, -1.2)):
+def photographs(camera, poses, pixels, names=None, keep=None):
+    """Photos of one camera."""
+    names = names or [f"{k}" for k in range(len(poses))]
+    table = posed_photos(names, [camera], np.zeros(len(poses), dtype=np.int64), Rigid3.stack(list(poses)))
+    return DecodedPhotos(table, tuple(pixels), tuple(keep or [None] * len(poses)))
+
+
+def ball_photos(n=8, camera=CAMERA, heights=(0.3, 1.6, -1.2)):
     """Photos of an opaque ball at the origin, coloured by its normal, with alpha."""
-    images = []
-    for k in range(n):
-        angle = 2 * np.pi * k / n
-        eye = np.array([3.2 * np.cos(angle), 3.2 * np.sin(angle), heights[k % len(heights)]])
-        images.append(ball_image(f"r_{k}", camera, eye))
-    return tuple(images)
+    angles = 2 * np.pi * np.arange(n) / n
+    return ball_photos_from(
+        camera, [np.array([3.2 * np.cos(a), 3.2 * np.sin(a), heights[k % len(heights)]]) for k, a in enumerate(angles)]
+    )
 
 
-def ball_image(name, camera, eye):
-    """The photo of the ball from a place."""
-    pose = look_at(eye, np.zeros(3), np.array([0.0, 0, 1]))
+def ball_photos_from(camera, places):
+    """Photos of the ball from some places."""
+    poses = [look_at(place, np.zeros(3), np.array([0.0, 0, 1])) for place in places]
+    return photographs(
+        camera, poses, [ball_pixels(camera, pose) for pose in poses], [f"r_{k}" for k in range(len(poses))]
+    )
+
+
+def ball_pixels(camera, pose):
+    """What a camera sees of the ball, RGBA."""
     rays = rays_from_view(camera, pose)
     b = np.sum(rays.origins * rays.directions, axis=1)
     discriminant = b**2 - np.sum(rays.origins**2, axis=1) + RADIUS**2
     normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
     rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
-    pixels = np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
-    return PosedImage(name, camera, pose, pixels)
+    return np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
 
 
 def random_field(rng, resolutions=(3, 6, 12), max_levels=4, density_bias=0.0):

@@ -8,13 +8,13 @@ from benchmarks.field import kernel_times
 
 from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.synthetic.light import level_camera
-from grid_scenes import FRAME, ball_images, plan_of
+from grid_scenes import FRAME, ball_photos, plan_of
 
 
 def test_every_kernel_of_a_step_is_timed():
     plan = plan_of(finest=32, steps=(2,) * 8, num_chunks=2, samples_per_chunk=512)
     with ThreadPoolExecutor(1) as executor:
-        training = prepare_grid_training(ball_images(), FRAME, plan, seed=0, executor=executor)
+        training = prepare_grid_training(ball_photos(), FRAME, plan, seed=0, executor=executor)
         state, _ = training.advance(training.start())
         rows, about = kernel_times(training, state)
     assert all(nanoseconds > 0 for _, nanoseconds in rows)

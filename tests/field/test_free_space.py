@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fieldstone.field.base.projection import projection_for
-from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, PosedImage, SeenPoints
+from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, SeenPoints
 from fieldstone.field.base.space import contracted_space, grid_from_normalized, projective_space
 from fieldstone.field.evidence.free_space import (
     FREE_FRACTION,
@@ -19,7 +19,7 @@ from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.scene.rays import rays_from_view
-from grid_scenes import CAMERA, FRAME
+from grid_scenes import CAMERA, FRAME, photographs
 
 PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
 WALL = 4.0
@@ -29,15 +29,13 @@ WORKER = ThreadPoolExecutor(1)
 def wall_scene(count):
     """Cameras side by side before a wall at z = 4, and what they see of it."""
     rng = np.random.default_rng(0)
-    images, seen = [], {}
-    for k in range(count):
-        pose = Rigid3(np.eye(3), np.array([0.05 * k, 0.0, 0.0]))
-        images.append(PosedImage(f"{k}", CAMERA, pose, PIXELS))
+    poses, seen = [Rigid3(np.eye(3), np.array([0.05 * k, 0.0, 0.0])) for k in range(count)], []
+    for pose in poses:
         wall = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.full(4000, WALL)])
         pixels = image_from_cam(CAMERA, pose.apply(wall))
         inside = np.all((pixels > 0) & (pixels < [CAMERA.width, CAMERA.height]), axis=1)
-        seen[f"{k}"] = SeenPoints(wall[inside], np.full(np.count_nonzero(inside), 0.01))
-    return images, seen
+        seen.append(SeenPoints(wall[inside], np.full(np.count_nonzero(inside), 0.01)))
+    return photographs(CAMERA, poses, [PIXELS] * count).posed, seen
 
 
 def box():
@@ -47,9 +45,9 @@ def box():
 
 def carved_before_wall(count):
     """What the photos of the wall see of it, the box before carving and after, and the corners of its cells."""
-    images, seen = wall_scene(count)
+    photos, seen = wall_scene(count)
     start = box()
-    carved = carve_free_space(start, images, FRAME, seen, contracted_space(), WORKER)
+    carved = carve_free_space(start, photos, FRAME, seen, contracted_space(), WORKER)
     return seen, start, carved.cells, corners_in_world(start, FRAME, contracted_space())
 
 
@@ -57,7 +55,7 @@ def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
     seen, start, cells, corners = carved_before_wall(3)
     near, far = corners[:-1, :-1, :-1], corners[1:, 1:, 1:]
     # Cells that hold a point of the wall are kept.
-    for points in seen.values():
+    for points in seen:
         before_plane = 0.999 * points.xyz  # the wall itself is a plane that cells share
         places = grid_from_normalized(contracted_space(), FRAME.normalized_from_world.apply(before_plane))
         assert cells[tuple(((places - start.lower) / start.cell_size).astype(int).T)].all()
@@ -72,10 +70,10 @@ def test_the_space_before_a_wall_is_free_and_the_wall_is_not():
 
 
 def test_photos_without_points_carve_nothing():
-    images, _ = wall_scene(2)
+    photos, _ = wall_scene(2)
     start = box()
-    few = {"0": SeenPoints(np.array([[0.0, 0, WALL]]), np.array([0.01]))}
-    carved = carve_free_space(start, images, FRAME, few, contracted_space(), WORKER)
+    few = [SeenPoints(np.array([[0.0, 0, WALL]]), np.array([0.01])), None]
+    carved = carve_free_space(start, photos, FRAME, few, contracted_space(), WORKER)
     np.testing.assert_array_equal(carved.cells, start.cells)
 
 
@@ -94,12 +92,12 @@ def test_what_no_photo_sees_is_empty_around_a_camera_only():
 
 def test_what_too_few_photos_see_from_near_is_not_there():
     """A ninth photo that looks elsewhere: nothing stands where it alone sees near places."""
-    images, seen = wall_scene(9)
+    photos, seen = wall_scene(9)
     aside = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    images[-1] = PosedImage("8", CAMERA, aside, PIXELS)
-    seen["8"] = SeenPoints(aside.inverse().apply(seen["0"].xyz), seen["0"].sigma)
+    photos = photos.at_poses(Rigid3.stack([*(photos.pose_of(v) for v in range(8)), aside]))
+    seen[8] = SeenPoints(aside.inverse().apply(seen[0].xyz), seen[0].sigma)
     start = box()
-    carved = carve_free_space(start, images, FRAME, seen, contracted_space(), WORKER)
+    carved = carve_free_space(start, photos, FRAME, seen, contracted_space(), WORKER)
     corners = corners_in_world(start, FRAME, contracted_space())
     behind = np.linalg.norm(np.nan_to_num(corners[:-1, :-1, :-1], nan=1e9) - [0.0, 0.0, -0.95 * WALL], axis=-1)
     assert not carved.cells.reshape(-1)[np.argmin(behind)]
@@ -110,10 +108,10 @@ def test_what_too_few_photos_see_from_near_is_not_there():
 @pytest.mark.parametrize("projected", [False, True])
 def test_corners_come_back_to_the_grid(projected):
     """The corners, put back into the space of the grid, lie on the grid; infinity is nan."""
-    images, seen = wall_scene(3)
+    photos, seen = wall_scene(3)
     space, start = contracted_space(), box()
     if projected:
-        found = projection_for(images, FRAME, seen["0"].xyz)
+        found = projection_for(photos, FRAME, seen[0].xyz)
         assert found is not None
         projection, bounds = found
         space = projective_space(projection)
@@ -131,15 +129,15 @@ def test_corners_come_back_to_the_grid(projected):
 
 
 def test_photos_probably_see_nearly_as_far_as_the_points_around():
-    images, seen = wall_scene(2)
+    photos, seen = wall_scene(2)
     world = Sim3(0.5, np.eye(3), np.zeros(3))
     frame = replace(FRAME, normalized_from_world=world)
-    for image in images:
-        found = free_distances(frame, seen)(image)
-        rays = rays_from_view(image.camera, image.cam_from_world)
+    for v in range(2):
+        found = free_distances(photos, frame, seen)(v)
+        rays = rays_from_view(CAMERA, photos.pose_of(v))
         true = 0.5 * WALL / rays.directions[:, 2]
         # Blocks of pixels take the least of the points around them.
         assert np.all(found < FREE_LOSS_FRACTION * true * 1.02)
         assert np.median(found / true) > 0.95 * FREE_LOSS_FRACTION
-    unknown = free_distances(frame, {})(images[0])
+    unknown = free_distances(photos, frame, [None, None])(0)
     np.testing.assert_array_equal(unknown, np.zeros(CAMERA.width * CAMERA.height))

@@ -19,13 +19,13 @@ from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.geometry.camera import Camera, bearings_from_image
 from fieldstone.scene.rays import pixel_centers, rays_from_view
-from grid_scenes import FRAME, RADIUS, ball_images, plan_of
+from grid_scenes import FRAME, RADIUS, ball_photos, plan_of
 
 PLAN = plan_of(finest=32, steps=(5, 5, 5, 5, 4, 3, 2, 1), num_chunks=4, samples_per_chunk=512)
 
 
-def training(executor, plan=PLAN, images=None, **options) -> GridTraining:
-    return prepare_grid_training(images or ball_images(), FRAME, plan, seed=0, executor=executor, **options)
+def training(executor, plan=PLAN, photos=None, **options) -> GridTraining:
+    return prepare_grid_training(photos or ball_photos(), FRAME, plan, seed=0, executor=executor, **options)
 
 
 def run(training, state, steps):
@@ -98,41 +98,40 @@ def test_a_stop_before_cells_change_their_size_does_not_change_a_bit(stop):
 
 @pytest.mark.parametrize("use_alpha", [True, False])
 def test_a_ball_is_learned_in_seconds(use_alpha):
-    images = ball_images(20)
+    photos = ball_photos(20)
     plan = PLAN.replaced(steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
-        work = training(executor, plan, images[1:], use_alpha=use_alpha)
+        work = training(executor, plan, photos.select(range(1, 20)), use_alpha=use_alpha)
         state, report = run(work, work.start(), plan.schedule.total_steps)
-        image = images[0]
-        rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
-    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
+        camera = photos.posed.camera_of(0)
+        rendered = work.renderer(state)(rays_from_view(camera, photos.posed.pose_of(0)))
+    shown = rendered.rgb.reshape(camera.height, camera.width, 3)
     assert report.mse < 0.01
     # The mean colour alone gives 9 dB.
-    assert psnr(shown, image.composited(FRAME.background)) > 24.0
-    center = shown.shape[0] // 2 * image.camera.width + image.camera.width // 2
+    assert psnr(shown, photos.composited(0, FRAME.background)) > 24.0
+    center = shown.shape[0] // 2 * camera.width + camera.width // 2
     assert rendered.opacity[center] > 0.95
     assert rendered.opacity[0] < 0.05
 
 
 def test_a_scene_with_points_is_contracted():
     """Cameras around an object, and points: everything beyond the box is contracted into a shell."""
-    images = tuple(
-        replace(image, pixels=image.pixels[..., :3] * (image.pixels[..., 3:] // 255)) for image in ball_images(20)
-    )
+    photos = ball_photos(20)
+    photos = replace(photos, pixels=tuple(rgba[..., :3] * (rgba[..., 3:] // 255) for rgba in photos.pixels))
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
     dark = replace(FRAME, background=np.zeros(3))
     plan = PLAN.replaced(steps=(20, 20, 20, 20, 20, 10, 5, 5))
     with ThreadPoolExecutor(2) as executor:
         work = prepare_grid_training(
-            images[1:], dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False
+            photos.select(range(1, 20)), dark, plan, seed=0, executor=executor, points_in_world=points, bounded=False
         )
         assert work.space.is_contracted
         state, _ = run(work, work.start(), plan.schedule.total_steps)
-        image = images[0]
-        rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
-    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
-    assert psnr(shown, image.composited(dark.background)) > 20.0
+        camera = photos.posed.camera_of(0)
+        rendered = work.renderer(state)(rays_from_view(camera, photos.posed.pose_of(0)))
+    shown = rendered.rgb.reshape(camera.height, camera.width, 3)
+    assert psnr(shown, photos.composited(0, dark.background)) > 20.0
     assert np.all(np.isfinite(rendered.depth))
 
 
@@ -140,7 +139,7 @@ def test_the_field_survives_saving():
     with ThreadPoolExecutor(1) as executor:
         work = training(executor)
         state, _ = run(work, work.start(), 30)
-        rays = rays_from_view(ball_images()[0].camera, ball_images()[0].cam_from_world)
+        rays = rays_from_view(ball_photos().posed.camera_of(0), ball_photos().posed.pose_of(0))
         before = work.renderer(state)(rays)
         again = work.renderer(work.from_tensors(work.to_tensors(state)))(rays)
     np.testing.assert_array_equal(before.rgb, again.rgb)
@@ -183,9 +182,10 @@ def test_a_checkpoint_without_an_array_is_refused(name):
 
 
 def test_photos_that_see_nothing_are_refused():
-    images = tuple(replace(image, pixels=np.zeros_like(image.pixels)) for image in ball_images())
+    photos = ball_photos()
+    photos = replace(photos, pixels=tuple(np.zeros_like(rgba) for rgba in photos.pixels))
     with ThreadPoolExecutor(1) as executor, pytest.raises(InputError, match="alpha"):
-        training(executor, images=images)
+        training(executor, photos=photos)
 
 
 @pytest.mark.parametrize(("finest", "min_weight"), [(32, 8e-3), (384, 8e-3), (384, 3e-2)])
@@ -202,7 +202,7 @@ def test_scouting_finds_the_box_around_the_ball():
     """Without alpha the box of the start is that of the frame; after one stage it is little more than the ball."""
     plan = PLAN.replaced(finest=64, steps=(120, 3, 1, 1, 1, 1, 1, 1))
     with ThreadPoolExecutor(2) as executor:
-        work = training(executor, plan, ball_images(20), use_alpha=False)
+        work = training(executor, plan, ball_photos(20), use_alpha=False)
         state, _ = run(work, work.start(), 121)
         np.testing.assert_allclose(work.occupancy.extent, 3.0)
         occupancy = state.field.occupancy
@@ -226,13 +226,14 @@ def test_no_ray_that_meets_a_cell_is_left_out(focal, cells):
     occupied[tuple(rng.integers(2, cells - 2, (3, 40)))] = True
     occupancy = Occupancy(np.full(3, -1.5), 3.0 / cells, occupied)
     box = occupancy_box(occupancy, occupancy.extent, box_space())
-    for image in ball_images(4, Camera("SIMPLE_PINHOLE", 81, 50, np.array([focal, 40.5, 25.0]))):
-        rays = rays_from_view(image.camera, image.cam_from_world)
+    camera = Camera("SIMPLE_PINHOLE", 81, 50, np.array([focal, 40.5, 25.0]))
+    for pose in ball_photos(4, camera).posed.cam_from_world:
+        rays = rays_from_view(camera, pose)
         center = rays.origins[0].astype(np.float32)
         expected = np.zeros(len(rays), dtype=np.uint8)
         rays_that_hit(box, center, rays.directions.astype(np.float32), expected)
-        bearings = bearings_from_image(image.camera, pixel_centers(81, 50)).astype(np.float32).reshape(50, 81, 3)
-        found = pixels_that_hit(box, center, image.cam_from_world.R.T.astype(np.float32), bearings, focal)
+        bearings = bearings_from_image(camera, pixel_centers(81, 50)).astype(np.float32).reshape(50, 81, 3)
+        found = pixels_that_hit(box, center, pose.R.T.astype(np.float32), bearings, focal)
         assert np.all(found.reshape(-1)[expected > 0])
         assert 0 < np.count_nonzero(expected) < found.size
         assert np.count_nonzero(found) < found.size

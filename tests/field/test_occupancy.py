@@ -8,7 +8,7 @@ from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.march_numba import distance_at
 from fieldstone.field.grid.occupancy import MAX_DISTANCE, Occupancy, cell_distances, full_box, visual_hull
-from grid_scenes import CAMERA, RADIUS, ball_images
+from grid_scenes import CAMERA, RADIUS, ball_photos
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.05, 1.0])
@@ -57,10 +57,10 @@ def test_resampling_never_loses_an_occupied_point(cell_size):
 
 
 def test_the_hull_of_a_ball_contains_it_and_little_else():
-    images = ball_images(24)
+    photos = ball_photos(24)
     box = full_box(np.full(3, -1.5), np.full(3, 3.0), 16)
-    masks = [image.pixels[..., 3] > 0 for image in images]
-    poses = [image.cam_from_world for image in images]
+    masks = [rgba[..., 3] > 0 for rgba in photos.pixels]
+    poses = [photos.posed.pose_of(v) for v in range(24)]
     with ThreadPoolExecutor(2) as executor:
         hull = visual_hull(box, masks, [CAMERA] * 24, poses, 32, executor)
     distance = np.linalg.norm(hull.centers(), axis=1).reshape(hull.cells.shape)

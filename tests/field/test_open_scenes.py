@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.ray_dataset import SeenPoints
 from fieldstone.field.base.space import contracted_space
 from fieldstone.field.grid.field import occupancy_box
 from fieldstone.field.grid.occupancy import full_box
@@ -16,7 +16,7 @@ from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.field.grid_training.training import GridTraining
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.scene.rays import rays_from_view
-from grid_scenes import CAMERA, FRAME, RADIUS, ball_images, plan_of
+from grid_scenes import CAMERA, FRAME, RADIUS, ball_photos, photographs, plan_of
 
 PLAN = plan_of(
     finest=32,
@@ -38,23 +38,22 @@ GAINS = 1.0 + 0.25 * np.cos(2.0 * np.arange(20))
 def photographed(seed=0):
     """The ball before black, every photo with another exposure, and points on it that each photo sees."""
     rng = np.random.default_rng(seed)
-    images, seen = [], {}
-    for gain, image in zip(GAINS, ball_images(20), strict=True):
-        rgb = np.where(image.pixels[..., 3:] > 127, image.pixels[..., :3], 0) * 0.7 * gain
-        images.append(replace(image, pixels=np.rint(rgb).astype(np.uint8)))
-        center = image.cam_from_world.target_origin_in_source()
+    photos, pixels, seen = ball_photos(20), [], []
+    for gain, rgba, center in zip(GAINS, photos.pixels, photos.posed.centers(), strict=True):
+        rgb = np.where(rgba[..., 3:] > 127, rgba[..., :3], 0) * 0.7 * gain
+        pixels.append(np.rint(rgb).astype(np.uint8))
         p = rng.normal(size=(200, 3))
         p *= RADIUS / np.linalg.norm(p, axis=1, keepdims=True)
         facing = p[np.einsum("ni,ni->n", p, center - p) > 0.3]
-        seen[image.name] = SeenPoints(facing, np.full(len(facing), 0.01))
-    return tuple(images), seen
+        seen.append(SeenPoints(facing, np.full(len(facing), 0.01)))
+    return replace(photos, pixels=tuple(pixels)), tuple(seen)
 
 
-def training(executor, images, seen, plan=PLAN) -> GridTraining:
-    points = np.concatenate([points.xyz for points in seen.values()])
+def training(executor, photos, seen, plan=PLAN) -> GridTraining:
+    points = np.concatenate([points.xyz for points in seen])
     dark = replace(FRAME, background=np.zeros(3))
     return prepare_grid_training(
-        images, dark, plan, seed=0, executor=executor, points_in_world=points, seen=seen, bounded=False
+        photos, dark, plan, seed=0, executor=executor, points_in_world=points, seen=seen, bounded=False
     )
 
 
@@ -71,11 +70,11 @@ def same_tensors(a, b):
 
 
 def test_neither_threads_nor_a_stop_change_a_bit():
-    images, seen = photographed()
+    photos, seen = photographed()
     results = []
     for threads in (1, 2):
         with ThreadPoolExecutor(threads) as executor:
-            work = training(executor, images, seen)
+            work = training(executor, photos, seen)
             state = run(work, work.start(), 45)
             if threads == 2:
                 saved = {name: array.copy() for name, array in work.to_tensors(state).items()}
@@ -86,26 +85,26 @@ def test_neither_threads_nor_a_stop_change_a_bit():
 
 
 def test_the_exposures_of_photos_are_told_from_the_colours_of_the_scene():
-    images, seen = photographed()
+    photos, seen = photographed()
     with ThreadPoolExecutor(2) as executor:
-        work = training(executor, images[1:], seen)
+        work = training(executor, photos.select(range(1, 20)), seen[1:])
         state = run(work, work.start(), PLAN.schedule.total_steps)
-        shown = work.renderer(state)(rays_from_view(CAMERA, images[0].cam_from_world)).rgb
+        shown = work.renderer(state)(rays_from_view(CAMERA, photos.posed.pose_of(0))).rgb
     found = np.exp(state.exposure.log_gain.reshape(-1, 3).mean(axis=1))
     assert np.corrcoef(found, GAINS[1:])[0, 1] > 0.9
     # With the mean exposure of all photos; the held-out one is 25 % brighter.
-    as_mean = np.rint(images[0].pixels / GAINS[0] * np.exp(np.log(GAINS[1:]).mean()))
+    as_mean = np.rint(photos.pixels[0] / GAINS[0] * np.exp(np.log(GAINS[1:]).mean()))
     assert psnr(shown.reshape(CAMERA.height, CAMERA.width, 3), as_mean / 255.0) > 22.0
 
 
 @pytest.mark.parametrize("clear", [True, False])
 def test_a_speck_in_the_air_is_given_up_when_its_stage_begins(clear):
     """Set by hand just before stage 3, beside spots of the same size on the ball, where there are known points."""
-    images, seen = photographed()
+    photos, seen = photographed()
     stage = 3
     plan = PLAN.replaced(clear_floaters_from=stage if clear else len(PLAN.schedule.steps))
     with ThreadPoolExecutor(1) as executor:
-        work = training(executor, images, seen, plan)
+        work = training(executor, photos, seen, plan)
         state = run(work, work.start(), sum(PLAN.schedule.steps[:stage]) - 1)
         layout, occupancy = state.field.layout, state.field.occupancy
         state.field.table[:] = 0.0
@@ -126,17 +125,15 @@ def test_a_speck_in_the_air_is_given_up_when_its_stage_begins(clear):
 
 def test_what_masks_leave_out_is_not_learned():
     """A wrong colour in a third of every photo does no harm under masks."""
-    images, _ = photographed()
-    masked = []
-    for image in images:
-        pixels, keep = image.pixels.copy(), np.ones((CAMERA.height, CAMERA.width), dtype=bool)
-        pixels[:, 26:] = (0, 255, 0)
-        keep[:, 26:] = False
-        masked.append(replace(image, pixels=pixels, keep=keep))
+    photos, _ = photographed()
+    keep = np.ones((CAMERA.height, CAMERA.width), dtype=bool)
+    keep[:, 26:] = False
+    wrong = tuple(np.where(keep[..., None], pixels, np.array([0, 255, 0], dtype=np.uint8)) for pixels in photos.pixels)
+    masked = replace(photos, pixels=wrong, keep=(keep,) * len(photos))
     with ThreadPoolExecutor(1) as executor:
         box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
-        rays = ray_table(tuple(masked), FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
-    assert len(rays.image) == len(images) * 26 * CAMERA.height
+        rays = ray_table(masked, FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
+    assert len(rays.image) == len(photos) * 26 * CAMERA.height
     assert not np.any((rays.rgba[:, 1] == 255) & (rays.rgba[:, 0] == 0))
 
 
@@ -148,20 +145,18 @@ def test_rays_of_distorted_photos_are_exact(model, lens):
     """A point on any ray of the table is seen by the distorted camera in the middle of the pixel of that ray."""
     focal = [45.0] if model == "SIMPLE_RADIAL" else [45.0, 44.0]
     camera = Camera(model, 40, 32, np.array([*focal, 20.5, 15.5, *lens]))
-    images = tuple(
-        PosedImage(i.name, camera, i.cam_from_world, np.arange(40 * 32 * 3).reshape(32, 40, 3).astype(np.uint8))
-        for i in ball_images(3)
-    )
+    pixels = np.arange(40 * 32 * 3).reshape(32, 40, 3).astype(np.uint8)
+    photos = photographs(camera, [ball_photos(3).posed.pose_of(v) for v in range(3)], [pixels] * 3)
     box = full_box(np.full(3, -1.5), np.full(3, 3.0), 4)
     with ThreadPoolExecutor(1) as executor:
-        table = ray_table(images, FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
+        table = ray_table(photos, FRAME, occupancy_box(box, box.extent, contracted_space()), executor)
     d = np.einsum("nij,nj->ni", table.rotations[table.image], table.bearings[table.bearing]).astype(np.float64)
-    for v, image in enumerate(images):
+    for v in range(3):
         rows = table.image == v
         points = table.centers[v] + 3.0 * d[rows]
-        pixels = image_from_cam(camera, image.cam_from_world.apply(points))
+        found = image_from_cam(camera, photos.posed.pose_of(v).apply(points))
         expected = np.stack([table.bearing[rows] % 40 + 0.5, table.bearing[rows] // 40 + 0.5], axis=1)
         # float32 rays: a few 1e-6 of the focal length.
-        np.testing.assert_allclose(pixels, expected, atol=1e-3)
-        shown = image.pixels.reshape(-1, 3)[table.bearing[rows]]
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+        shown = pixels.reshape(-1, 3)[table.bearing[rows]]
         np.testing.assert_array_equal(table.rgba[rows, :3], shown)

@@ -8,37 +8,34 @@ from fieldstone.field.base.projection import (
     projection_for,
     unproject_points,
 )
-from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.field.base.space_numba import project_ray_numba
 from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import exp
 from fieldstone.scene.rays import rays_from_view
-from grid_scenes import CAMERA, FRAME
+from grid_scenes import CAMERA, FRAME, photographs
 
 PIXELS = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
 
 
-def forward_images(rng, count=6):
+def forward_photos(rng, count=6):
     """Cameras side by side that look along z, turned by a few degrees."""
-    return tuple(
-        PosedImage(f"p{k}", CAMERA, Rigid3(exp(rng.normal(scale=0.05, size=3)), rng.normal(scale=0.1, size=3)), PIXELS)
-        for k in range(count)
-    )
+    poses = [Rigid3(exp(rng.normal(scale=0.05, size=3)), rng.normal(scale=0.1, size=3)) for _ in range(count)]
+    return photographs(CAMERA, poses, [PIXELS] * count).posed
 
 
 @pytest.fixture
 def space():
     rng = np.random.default_rng(0)
-    images = forward_images(rng)
+    photos = forward_photos(rng)
     points = np.column_stack([rng.uniform(-1, 1, (500, 2)), rng.uniform(2, 9, 500)])
-    found = projection_for(images, FRAME, points)
+    found = projection_for(photos, FRAME, points)
     assert found is not None
-    return *found, images
+    return *found, photos
 
 
 def test_points_of_a_ray_stay_on_its_projection(space):
-    projection, _, images = space
-    rays = rays_from_view(images[0].camera, images[0].cam_from_world)
+    projection, _, photos = space
+    rays = rays_from_view(CAMERA, photos.pose_of(0))
     start, direction, length = project_rays(projection, rays.origins, rays.directions)
     for t in (2.5, 7.0, 300.0):
         points = project_points(projection, rays.origins + t * rays.directions)
@@ -58,9 +55,9 @@ def test_points_come_back_from_the_projection(space):
 
 
 def test_the_box_holds_all_rays(space):
-    projection, bounds, images = space
-    for image in images:
-        rays = rays_from_view(image.camera, image.cam_from_world)
+    projection, bounds, photos = space
+    for v in range(len(photos)):
+        rays = rays_from_view(CAMERA, photos.pose_of(v))
         start, direction, length = project_rays(projection, rays.origins, rays.directions)
         ends = np.concatenate([start, start + length[:, None] * direction])
         assert np.all(ends >= bounds[0] - 1e-6)
@@ -68,8 +65,8 @@ def test_the_box_holds_all_rays(space):
 
 
 def test_kernel_matches_reference(space):
-    projection, _, images = space
-    rays = rays_from_view(images[1].camera, images[1].cam_from_world)
+    projection, _, photos = space
+    rays = rays_from_view(CAMERA, photos.pose_of(1))
     directions = rays.directions.copy()
     directions[0] = -directions[0]
     start, expected, length = project_rays(projection, rays.origins, directions)
@@ -84,9 +81,7 @@ def test_kernel_matches_reference(space):
 
 def test_cameras_around_an_object_get_no_projective_space():
     up = np.array([0.0, 0, 1])
-    images = tuple(
-        PosedImage(f"{k}", CAMERA, look_at(3 * np.array([np.cos(k), np.sin(k), 0.2]), np.zeros(3), up), PIXELS)
-        for k in range(6)
-    )
-    assert projection_for(images, FRAME, np.random.default_rng(0).normal(size=(100, 3))) is None
-    assert projection_for(images, FRAME, np.empty((0, 3))) is None
+    poses = [look_at(3 * np.array([np.cos(k), np.sin(k), 0.2]), np.zeros(3), up) for k in range(6)]
+    photos = photographs(CAMERA, poses, [PIXELS] * 6).posed
+    assert projection_for(photos, FRAME, np.random.default_rng(0).normal(size=(100, 3))) is None
+    assert projection_for(photos, FRAME, np.empty((0, 3))) is None

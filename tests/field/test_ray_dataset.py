@@ -4,14 +4,12 @@ import pytest
 from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RenderedRays, in_world
 from fieldstone.field.base.ray_dataset import (
-    PosedImage,
     RayDataset,
     area_weights,
     blender_frame,
     default_background,
     frame_from_points,
-    reduce_image,
-    reduce_images,
+    reduce_photos,
     split_every,
     training_rays,
 )
@@ -22,17 +20,22 @@ from fieldstone.geometry.sim3 import Sim3
 from fieldstone.scene.rays import pixel_centers, rays_from_view
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
+from grid_scenes import photographs
 
 
 def simple_camera(width=6, height=4):
     return Camera("SIMPLE_PINHOLE", width, height, np.array([5.0, width / 2, height / 2]))
 
 
-def random_image(seed, camera, channels=4):
+def random_pose(seed):
     rng = np.random.default_rng(seed)
-    pose = Rigid3(rotation.exp(rng.standard_normal(3)), rng.standard_normal(3))
-    pixels = rng.integers(0, 256, (camera.height, camera.width, channels)).astype(np.uint8)
-    return PosedImage(f"image{seed}.png", camera, pose, pixels)
+    return Rigid3(rotation.exp(rng.standard_normal(3)), rng.standard_normal(3))
+
+
+def random_photos(camera, channels=(4, 4, 4)):
+    rng = np.random.default_rng(0)
+    pixels = [rng.integers(0, 256, (camera.height, camera.width, c)).astype(np.uint8) for c in channels]
+    return photographs(camera, [random_pose(seed) for seed in range(len(channels))], pixels)
 
 
 def random_frame():
@@ -43,26 +46,26 @@ def random_frame():
 
 def test_rays_of_the_table_pass_through_the_points_that_their_pixels_show():
     camera, frame = simple_camera(), random_frame()
-    images = tuple(random_image(seed, camera) for seed in range(3))
-    table = training_rays(images, frame)
+    photos = random_photos(camera)
+    table = training_rays(photos, frame)
     assert len(table) == 3 * 24
-    for v, image in enumerate(images):
+    for v in range(3):
+        pose = photos.posed.pose_of(v)
         rays, colors = table.whole_image(v)
         # Points on each ray, moved back to the camera, fall on the pixel centres.
         points = rays.origins + 2.5 * rays.directions
-        in_cam = image.cam_from_world.apply(frame.normalized_from_world.inverse().apply(points.astype(np.float64)))
+        in_cam = pose.apply(frame.normalized_from_world.inverse().apply(points.astype(np.float64)))
         np.testing.assert_allclose(image_from_cam(camera, in_cam), pixel_centers(6, 4), atol=1e-4)
         np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1.0, rtol=1e-6)
-        np.testing.assert_allclose(colors.reshape(4, 6, 3), image.composited(frame.background), rtol=1e-6)
-        in_world_rays = frame.normalize(rays_from_view(camera, image.cam_from_world))
+        np.testing.assert_allclose(colors.reshape(4, 6, 3), photos.composited(v, frame.background), rtol=1e-6)
+        in_world_rays = frame.normalize(rays_from_view(camera, pose))
         np.testing.assert_allclose(rays.directions, in_world_rays.directions, atol=1e-6)
         np.testing.assert_allclose(rays.origins, in_world_rays.origins, atol=1e-5)
         np.testing.assert_allclose(rays.pixel_radius, in_world_rays.pixel_radius, rtol=1e-6)
 
 
 def test_batches_are_rows_of_the_table():
-    images = tuple(random_image(seed, simple_camera()) for seed in range(3))
-    table = training_rays(images, random_frame())
+    table = training_rays(random_photos(simple_camera()), random_frame())
     index = np.random.default_rng(0).integers(len(table), size=50)
     rays, colors = table.batch(index)
     whole = [table.whole_image(v) for v in range(3)]
@@ -74,7 +77,7 @@ def test_batches_are_rows_of_the_table():
 def test_pixels_outside_of_the_lens_are_left_out():
     # r (1 + k r^2) with k = -1 reaches at most 0.385: the corners (|u| up to 0.6) have no ray.
     camera = Camera("SIMPLE_RADIAL", 6, 4, np.array([5.0, 3.0, 2.0, -1.0]))
-    table = training_rays((random_image(0, camera), random_image(1, camera, channels=3)), blender_frame())
+    table = training_rays(random_photos(camera, channels=(4, 3)), blender_frame())
     centers = (pixel_centers(6, 4) - [3.0, 2.0]) / 5.0
     reached = np.linalg.norm(centers, axis=1) < np.sqrt(1 / 3) * 2 / 3
     assert 0 < np.count_nonzero(reached) < 24
@@ -84,18 +87,14 @@ def test_pixels_outside_of_the_lens_are_left_out():
     assert len(colors) == np.count_nonzero(reached)
 
 
-def test_compositing_on_white():
-    pixels = np.array([[[255, 0, 0, 0], [0, 0, 255, 255], [255, 0, 0, 51]]], dtype=np.uint8)
-    image = PosedImage("a", simple_camera(3, 1), Rigid3.identity(), pixels)
-    expected = [[[1, 1, 1], [0, 0, 1], [1, 0.8, 0.8]]]
-    np.testing.assert_allclose(image.composited(np.ones(3)), expected, rtol=1e-6)
-    np.testing.assert_array_equal(default_background((image,)), np.ones(3))
+def test_background_of_photos_with_alpha_is_white():
+    np.testing.assert_array_equal(default_background(random_photos(simple_camera(), channels=(3, 4))), np.ones(3))
 
 
 def test_background_of_photos_without_alpha_is_their_mean_colour():
-    images = tuple(random_image(seed, simple_camera(), channels=3) for seed in range(2))
-    expected = np.concatenate([image.pixels.reshape(-1, 3) for image in images]).mean(axis=0) / 255
-    np.testing.assert_allclose(default_background(images), expected, rtol=1e-12)
+    photos = random_photos(simple_camera(), channels=(3, 3))
+    expected = np.concatenate([pixels.reshape(-1, 3) for pixels in photos.pixels]).mean(axis=0) / 255
+    np.testing.assert_allclose(default_background(photos), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "new_size"), [(6, 3), (7, 3), (5, 4), (5, 5), (9, 1)])
@@ -113,21 +112,20 @@ def test_reducing_keeps_alpha_weighted_colour_and_the_view():
     pixels = np.zeros((4, 6, 4), dtype=np.uint8)
     pixels[:, ::2] = [200, 100, 40, 255]
     pixels[:, 1::2] = [7, 255, 9, 0]
-    small = reduce_image(PosedImage("a", camera, Rigid3.identity(), pixels), 3)
-    assert small.pixels.shape == (2, 3, 4)
-    np.testing.assert_array_equal(small.pixels, np.broadcast_to([200, 100, 40, 128], (2, 3, 4)))
-    np.testing.assert_allclose(small.camera.params, camera.params / 2)
+    keep = np.ones((4, 6), dtype=bool)
+    keep[3, 5] = False
+    large = photographs(camera, [Rigid3.identity()], [pixels], keep=[keep])
+    reduced = reduce_photos(large, 3)
+    small, small_keep = reduced.pixels[0], reduced.keep[0]
+    assert small.shape == (2, 3, 4)
+    np.testing.assert_array_equal(small_keep, [[True, True, True], [True, True, False]])
+    np.testing.assert_array_equal(small, np.broadcast_to([200, 100, 40, 128], (2, 3, 4)))
+    small_camera = reduced.posed.camera_of(0)
+    np.testing.assert_allclose(small_camera.params, camera.params / 2)
     # The mean of four rays' pixels is the pixel of the reduced camera.
     point = np.array([[0.3, -0.2, 1.0]])
-    np.testing.assert_allclose(image_from_cam(small.camera, point), image_from_cam(camera, point) / 2)
-    large = PosedImage("a", camera, Rigid3.identity(), pixels)
-    assert reduce_image(large, 6) is large
-
-
-def test_reduced_images_share_their_camera():
-    camera = simple_camera()
-    reduced = reduce_images(tuple(random_image(seed, camera) for seed in range(3)), 3)
-    assert len({id(image.camera) for image in reduced}) == 1
+    np.testing.assert_allclose(image_from_cam(small_camera, point), image_from_cam(camera, point) / 2)
+    assert reduce_photos(large, 6).pixels[0] is pixels
 
 
 def test_every_eighth_by_name_is_held_out():
@@ -173,7 +171,7 @@ def test_frame_from_points_needs_points():
 def test_renderer_in_the_world_scales_depth_back():
     frame = random_frame()
     camera = simple_camera()
-    rays = rays_from_view(camera, random_image(3, camera).cam_from_world)
+    rays = rays_from_view(camera, random_pose(3))
     plane_normal, plane_offset = np.array([0.2, -0.5, 0.7]), 1.3
 
     def depth_of_plane(normalized_rays):
@@ -187,11 +185,11 @@ def test_renderer_in_the_world_scales_depth_back():
 
 
 def test_bad_datasets_are_refused():
+    photos = random_photos(simple_camera())
+    none = photos.select([])
     with pytest.raises(InputError, match="no photo to train on"):
-        RayDataset((), (), blender_frame(), np.empty((0, 3)))
-    with pytest.raises(InputError, match="6x4"):
-        PosedImage("a", simple_camera(7, 4), Rigid3.identity(), np.zeros((4, 6, 3), dtype=np.uint8))
-    with pytest.raises(InputError, match="channels"):
-        PosedImage("a", simple_camera(), Rigid3.identity(), np.zeros((4, 6, 2), dtype=np.uint8))
+        RayDataset(none, none, blender_frame(), np.empty((0, 3)))
+    with pytest.raises(ValueError, match="points of 2"):
+        RayDataset(photos, none, blender_frame(), np.empty((0, 3)), seen=(None, None))
     with pytest.raises(ValueError, match="near < far"):
         FieldFrame(blender_frame().normalized_from_world, 3.0, 2.0, np.zeros(3))

@@ -21,7 +21,7 @@ from fieldstone.field.grid.step_numba import GRADIENT_SCALE
 from fieldstone.field.grid.terms_numba import Terms
 from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.scene.rays import rays_from_view
-from grid_scenes import CAMERA, FRAME, RADIUS, ball_image, ball_images, plan_of, random_field, random_rays
+from grid_scenes import CAMERA, FRAME, RADIUS, ball_photos, ball_photos_from, plan_of, random_field, random_rays
 
 torch = pytest.importorskip("torch")
 
@@ -50,40 +50,39 @@ OPEN = PLAN.replaced(
 )
 
 
-def seen_by(images, points):
+def seen_by(photos, points):
     """What faces each camera of points on the ball."""
-    centers = [image.cam_from_world.target_origin_in_source() for image in images]
-    facing = [points[np.einsum("ni,ni->n", points, c - points) > 0.3] for c in centers]
-    return {image.name: SeenPoints(p, np.full(len(p), 0.01)) for image, p in zip(images, facing, strict=True)}
+    facing = [points[np.einsum("ni,ni->n", points, c - points) > 0.3] for c in photos.posed.centers()]
+    return [SeenPoints(p, np.full(len(p), 0.01)) for p in facing]
 
 
 def photographed(scene, executor, plan=None):
     """The training of a kind of scene, and a photo that it does not have."""
-    images = ball_images(20)
+    photos = ball_photos(20)
     if scene in ("alpha", "no alpha"):
-        work = prepare_grid_training(
-            images[1:], FRAME, plan or PLAN, seed=0, executor=executor, use_alpha=scene == "alpha"
-        )
-        return work, images[0]
+        others = photos.select(range(1, 20))
+        work = prepare_grid_training(others, FRAME, plan or PLAN, seed=0, executor=executor, use_alpha=scene == "alpha")
+        return work, photos.select([0])
     if scene == "forward":
         places = [np.array([x, -3.2, z]) for x in (-0.4, 0.0, 0.4) for z in (-0.3, 0.0, 0.3)]
-        images = [ball_image(f"r_{k}", CAMERA, place) for k, place in enumerate(places)]
-    dark = [np.where(image.pixels[..., 3:] > 127, image.pixels[..., :3], 0) for image in images]
-    images = tuple(replace(image, pixels=np.ascontiguousarray(p)) for image, p in zip(images, dark, strict=True))
+        photos = ball_photos_from(CAMERA, places)
+    dark = [np.where(pixels[..., 3:] > 127, pixels[..., :3], 0) for pixels in photos.pixels]
+    photos = replace(photos, pixels=tuple(np.ascontiguousarray(p) for p in dark))
+    others = photos.select(range(1, len(photos)))
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
     work = prepare_grid_training(
-        images[1:],
+        others,
         replace(FRAME, background=np.zeros(3)),
         plan or OPEN,
         seed=0,
         executor=executor,
         points_in_world=points,
-        seen=seen_by(images, points),
+        seen=seen_by(others, points),
         bounded=False,
     )
     assert work.space.is_projective == (scene == "forward")
-    return work, images[0]
+    return work, photos.select([0])
 
 
 SCENES = ["alpha", "no alpha", "around", "forward"]
@@ -270,21 +269,21 @@ def test_depths_run_along_each_ray_on_its_own():
 def test_it_learns_as_well_as_the_kernels(scene):
     """The same plan, through all stages: the loss falls as far, and a photo that was left out is met as well."""
     with ThreadPoolExecutor(1) as executor:
-        work, image = photographed(scene, executor)
-        expected, actual = (learned(one, image) for one in (work, TorchGridTraining(work, CPU)))
+        work, photo = photographed(scene, executor)
+        expected, actual = (learned(one, photo) for one in (work, TorchGridTraining(work, CPU)))
     # What two seeds of one learner differ by.
     assert actual > expected - 1.0
 
 
-def learned(work: FieldTraining, image):
+def learned(work: FieldTraining, photo):
     """PSNR of a photo after the whole plan, in dB."""
     assert isinstance(work, FieldTraining)
     state, reports = run(work, work.start(), PLAN.schedule.total_steps)
-    rendered = work.renderer(state)(rays_from_view(image.camera, image.cam_from_world))
+    rendered = work.renderer(state)(rays_from_view(CAMERA, photo.posed.pose_of(0)))
     losses = [report.loss for report in reports]
     assert np.mean(losses[-5:]) < 0.1 * np.mean(losses[:5])
-    shown = rendered.rgb.reshape(image.camera.height, image.camera.width, 3)
-    return psnr(shown, image.composited(FRAME.background if image.pixels.shape[2] == 4 else np.zeros(3)))
+    shown = rendered.rgb.reshape(CAMERA.height, CAMERA.width, 3)
+    return psnr(shown, photo.composited(0, FRAME.background if photo.have_alpha else np.zeros(3)))
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -304,12 +303,12 @@ def test_rays_that_meet_nothing_move_nothing(scene):
 
 def test_the_field_survives_saving_and_is_rendered_without_torch():
     with ThreadPoolExecutor(1) as executor:
-        work, image = photographed("around", executor)
+        work, photo = photographed("around", executor)
         twin = TorchGridTraining(work, CPU)
         state, _ = run(twin, twin.start(), 30)
         saved = copied(twin.to_tensors(state))
         same_tensors(twin.to_tensors(twin.from_tensors(saved)), saved)
-        rays = rays_from_view(image.camera, image.cam_from_world)
+        rays = rays_from_view(CAMERA, photo.posed.pose_of(0))
         shown = twin.renderer(state)(rays)
         again = renderer(field_from_tensors(saved), work.frame, executor)(rays)
     np.testing.assert_array_equal(shown.rgb, again.rgb)

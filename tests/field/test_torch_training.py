@@ -7,12 +7,13 @@ import pytest
 from fieldstone.errors import InputError
 from fieldstone.field.base.adam import adam_estimates
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage, training_rays
+from fieldstone.field.base.ray_dataset import training_rays
 from fieldstone.field.base.training import NERF, PRESETS, TINY, TrainOptions, train
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import look_at
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.scene.rays import Rays, rays_from_view
+from grid_scenes import photographs
 
 torch = pytest.importorskip("torch")
 
@@ -28,9 +29,9 @@ FRAME = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 4.5, np.ones(3))
 CAMERA = Camera("SIMPLE_PINHOLE", 16, 12, np.array([18.0, 8.0, 6.0]))
 
 
-def ball_images(n=4):
+def ball_photos(n=4):
     """Photos of an opaque ball at the origin, coloured by its normal, with alpha."""
-    images = []
+    poses, pixels = [], []
     for k in range(n):
         angle = 2 * np.pi * k / n
         pose = look_at(3.2 * np.array([np.cos(angle), np.sin(angle), 0.3]), np.zeros(3), np.array([0.0, 0, 1]))
@@ -39,14 +40,13 @@ def ball_images(n=4):
         discriminant = b**2 - np.sum(rays.origins**2, axis=1) + 0.8**2
         normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
         rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
-        images.append(
-            PosedImage(f"{k}", CAMERA, pose, np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8).reshape(12, 16, 4))
-        )
-    return tuple(images)
+        poses.append(pose)
+        pixels.append(np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8).reshape(12, 16, 4))
+    return photographs(CAMERA, poses, pixels)
 
 
-def training(options, workers, *, images=None, seed=3, **settings):
-    rays = training_rays(ball_images() if images is None else images, FRAME)
+def training(options, workers, *, photos=None, seed=3, **settings):
+    rays = training_rays(photos or ball_photos(), FRAME)
     return TorchTraining(options, FRAME, rays, seed, torch.device("cpu"), workers, **settings)
 
 
@@ -144,12 +144,12 @@ def test_a_small_field_learns_a_ball(options):
         t = training(replace(options, learning_rate=5e-3, final_learning_rate=5e-3), workers)
         state, curve = train(t, t.start(), budget_s=None, max_steps=steps)
         # Far better than the best flat picture, and opaque where the ball is.
-        image = ball_images()[0]
-        rendered = t.renderer(state)(rays_from_view(CAMERA, image.cam_from_world))
-    colors = image.composited(FRAME.background).reshape(-1, 3)
+        photos = ball_photos()
+        rendered = t.renderer(state)(rays_from_view(CAMERA, photos.posed.pose_of(0)))
+    colors = photos.composited(0, FRAME.background).reshape(-1, 3)
     flat = np.mean((colors - colors.mean(axis=0)) ** 2)
     assert np.mean((rendered.rgb - colors) ** 2) < 0.3 * flat
-    alpha = image.pixels[..., 3].ravel() / 255
+    alpha = photos.pixels[0][..., 3].ravel() / 255
     assert np.corrcoef(rendered.opacity, alpha)[0, 1] > 0.8
     assert curve[-1].psnr > curve[0].psnr + 3
 
@@ -158,7 +158,7 @@ def test_renderer_takes_any_number_of_rays():
     with torch_workers(2) as workers:
         t = training(SMALL_NERF, workers)
         render = t.renderer(t.start())
-        rays = rays_from_view(CAMERA, ball_images()[0].cam_from_world)
+        rays = rays_from_view(CAMERA, ball_photos().posed.pose_of(0))
         whole = render(rays)
         part = render(Rays(rays.origins[7:9], rays.directions[7:9], rays.pixel_radius[7:9]))
         np.testing.assert_allclose(part.rgb, whole.rgb[7:9], rtol=1e-4, atol=1e-6)
@@ -204,8 +204,8 @@ def test_numbers_that_are_not_finite_are_a_collapse():
 
 def test_flat_photos_are_no_collapse():
     pixels = np.full((12, 16, 3), 130, dtype=np.uint8)
-    images = tuple(replace(image, pixels=pixels) for image in ball_images())
-    tensors, _ = run(SMALL_TINY, 3, images=images)
+    photos = ball_photos()
+    tensors, _ = run(SMALL_TINY, 3, photos=replace(photos, pixels=(pixels,) * len(photos)))
     assert tensors["flat_steps"] == 0
 
 

@@ -12,7 +12,7 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.images.photos import write_photo
-from fieldstone.io.posed.blender import is_blender_folder, read_blender, read_split
+from fieldstone.io.posed.blender import is_blender_folder, read_blender
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
 from matchers import assert_rigid3_near
 from mutations import check_mutations
@@ -47,18 +47,21 @@ def test_a_written_scene_is_read_back(tmp_path):
     assert is_blender_folder(tmp_path)
     scene = read_blender(tmp_path)
     assert scene.problems == ()
-    assert (scene.near, scene.far) == (2.0, 6.0)
+    assert scene.depth_range == (2.0, 6.0)
+    assert len(scene.photos.cameras) == 1
     for split, expected in poses.items():
-        frames = scene.splits[split]
-        assert [frame.name for frame in frames] == [f"r_{i}" for i in range(len(expected))]
-        for frame, pose in zip(frames, expected, strict=True):
-            assert_rigid3_near(frame.cam_from_world, pose, angle=1e-12, distance=1e-12)
-        read, problems = read_split(scene, split)
-        assert problems == []
-        for i, (frame, photo) in enumerate(read):
-            assert frame is frames[i]
-            assert photo.pixels.shape == (HEIGHT, WIDTH, 4)
-            assert np.all(photo.pixels == 10 * i)
+        photos = scene.photos.select(scene.splits[split])
+        assert photos.names == tuple(f"r_{i}" for i in range(len(expected)))
+        assert photos.paths == tuple(tmp_path / split / f"r_{i}.png" for i in range(len(expected)))
+        for i, pose in enumerate(expected):
+            assert_rigid3_near(photos.pose_of(i), pose, angle=1e-12, distance=1e-12)
+    np.testing.assert_array_equal(scene.held_out(), scene.splits["test"])
+
+
+def test_without_test_photos_those_of_validation_are_held_out(tmp_path):
+    write_scene(tmp_path, {"train": 3, "val": 2})
+    scene = read_blender(tmp_path)
+    np.testing.assert_array_equal(scene.held_out(), [3, 4])
 
 
 def test_projection_follows_the_definition_of_the_format(tmp_path):
@@ -70,8 +73,8 @@ def test_projection_follows_the_definition_of_the_format(tmp_path):
     right, up, backward = (np.sum((points - matrix[:3, 3]) * matrix[:3, k], axis=1) for k in range(3))
     half_width = np.tan(ANGLE_X / 2) * -backward
     expected = np.stack([(right / half_width + 1) * WIDTH / 2, HEIGHT / 2 - up / half_width * WIDTH / 2], axis=1)
-    in_cam = scene.splits["train"][1].cam_from_world.apply(points)
-    np.testing.assert_allclose(image_from_cam(scene.camera, in_cam), expected, rtol=1e-9)
+    in_cam = scene.photos.pose_of(1).apply(points)
+    np.testing.assert_allclose(image_from_cam(scene.photos.camera_of(1), in_cam), expected, rtol=1e-9)
 
 
 def test_some_missing_images_are_reported_and_skipped(tmp_path, caplog):
@@ -79,21 +82,10 @@ def test_some_missing_images_are_reported_and_skipped(tmp_path, caplog):
     (tmp_path / "train" / "r_1.png").unlink()
     (tmp_path / "test" / "r_0.png").write_bytes(b"no image")
     scene = read_blender(tmp_path)
-    assert [frame.name for frame in scene.splits["train"]] == ["r_0", "r_2"]
-    assert [frame.name for frame in scene.splits["test"]] == ["r_1"]
+    assert scene.photos.select(scene.splits["train"]).names == ("r_0", "r_2")
+    assert scene.photos.select(scene.splits["test"]).names == ("r_1",)
     assert [problem.path.name for problem in scene.problems] == ["r_1.png", "r_0.png"]
     assert "1 of 3 images are missing" in caplog.text
-
-
-def test_a_truncated_image_is_reported_when_it_is_decoded(tmp_path):
-    write_scene(tmp_path, {"train": 3})
-    path = tmp_path / "train" / "r_2.png"
-    path.write_bytes(path.read_bytes()[:-25])
-    read, problems = read_split(read_blender(tmp_path), "train")
-    assert [frame.name for frame, _ in read] == ["r_0", "r_1"]
-    assert [problem.path.name for problem in problems] == ["r_2.png"]
-    with pytest.raises(InputError, match="no test images; it has train"):
-        read_split(read_blender(tmp_path), "test")
 
 
 def test_no_training_image_at_all_is_an_error(tmp_path):
@@ -166,8 +158,7 @@ def test_damaged_files_end_in_an_input_error_or_a_sound_scene(tmp_path):
     write_scene(tmp_path, {"train": 2})
 
     def check(scene):
-        for frame in scene.splits["train"]:
-            R = frame.cam_from_world.R
+        for R in scene.photos.cam_from_world.R:
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
 
     loaded, refused = check_mutations(
@@ -179,9 +170,10 @@ def test_damaged_files_end_in_an_input_error_or_a_sound_scene(tmp_path):
 def test_real_scene_has_its_known_cameras():
     scene = read_blender(data_folder("lego_100"))
     assert {split: len(frames) for split, frames in scene.splits.items()} == {"train": 100, "val": 100, "test": 200}
-    np.testing.assert_allclose(scene.camera.params, [0.5 * 100 / np.tan(0.5 * 0.6911112070083618), 50, 50])
-    centers = np.array([f.cam_from_world.target_origin_in_source() for f in scene.splits["train"]])
+    np.testing.assert_allclose(scene.photos.cameras[0].params, [0.5 * 100 / np.tan(0.5 * 0.6911112070083618), 50, 50])
+    photos = scene.photos.select(scene.splits["train"])
+    centers = photos.centers()
     np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 4.031, atol=1e-3)
-    axes = np.array([f.cam_from_world.R[2] for f in scene.splits["train"]])
+    axes = photos.cam_from_world.R[:, 2]
     # Every camera looks at the origin.
     np.testing.assert_allclose(axes, -centers / np.linalg.norm(centers, axis=1, keepdims=True), atol=1e-5)

@@ -33,22 +33,22 @@ def test_a_point_falls_where_the_definition_puts_it(tmp_path):
     rows = write_scene(tmp_path)
     assert is_llff_folder(tmp_path)
     scene = read_llff(tmp_path)
-    assert scene.test is None
-    assert [photo.name for photo in scene.train] == ["p0.png", "p1.png", "p2.png"]
-    for photo, row in zip(scene.train, rows, strict=True):
+    assert not scene.splits
+    assert list(scene.photos.names) == ["p0.png", "p1.png", "p2.png"]
+    assert len(scene.photos.cameras) == 1
+    for v, row in enumerate(rows):
         matrix = row[:15].reshape(3, 5)
         down, right, back = (POINT - matrix[:, 3]) @ matrix[:, :3]
         # The copy has a tenth of the pixels.
         expected = 0.1 * np.array([FOCAL * right / -back + WIDTH / 2, FOCAL * down / -back + HEIGHT / 2])
-        np.testing.assert_allclose(
-            image_from_cam(photo.camera, photo.cam_from_world.apply(POINT[None]))[0], expected, rtol=1e-9
-        )
+        in_cam = scene.photos.pose_of(v).apply(POINT[None])
+        np.testing.assert_allclose(image_from_cam(scene.photos.camera_of(v), in_cam)[0], expected, rtol=1e-9)
 
 
 def test_points_lie_at_the_two_depths(tmp_path):
     write_scene(tmp_path)
     scene = read_llff(tmp_path)
-    depths = scene.train[0].cam_from_world.apply(scene.points_in_world[:10])[:, 2]
+    depths = scene.photos.pose_of(0).apply(scene.points_in_world[:10])[:, 2]
     np.testing.assert_allclose(depths, [2.0] * 5 + [10.0] * 5)
 
 
@@ -56,8 +56,8 @@ def test_the_largest_copy_is_taken_unless_one_is_given(tmp_path):
     write_scene(tmp_path)
     for k in range(3):
         write_photo(tmp_path / "images_5" / f"p{k}.png", np.zeros((60, 80, 3), dtype=np.uint8))
-    assert read_llff(tmp_path).train[0].camera.width == 80
-    assert read_llff(tmp_path, tmp_path / "images_10").train[0].camera.width == 40
+    assert read_llff(tmp_path).photos.camera_of(0).width == 80
+    assert read_llff(tmp_path, tmp_path / "images_10").photos.camera_of(0).width == 40
 
 
 def edited(tmp_path, edit):
@@ -96,9 +96,9 @@ def test_a_damaged_file_and_missing_photos_are_named(tmp_path):
 
 def test_fern_is_read():
     folder = data_folder("llff_fern")
-    scene = read_llff(folder)
-    assert len(scene.train) == 20
-    assert (scene.train[0].camera.width, scene.train[0].camera.height) == (504, 378)
+    photos = read_llff(folder).photos
+    assert len(photos) == 20
+    assert (photos.camera_of(0).width, photos.camera_of(0).height) == (504, 378)
     # The optical axes of photos of one plant point the same way.
-    axes = np.array([photo.cam_from_world.R[2] for photo in scene.train])
+    axes = photos.cam_from_world.R[:, 2]
     assert (axes @ axes.mean(axis=0)).min() > 0.9

@@ -76,21 +76,22 @@ def pixel_by_definition(matrix, fx, fy, cx, cy, k1=0.0, k2=0.0, p1=0.0, p2=0.0, 
 )
 def test_a_point_falls_where_the_definition_puts_it(tmp_path, top, definition):
     scene = read_transforms(write_scene(tmp_path, top))
-    assert scene.test is None
+    photos = scene.photos
+    assert not scene.splits
     # Natural order: f8, f9, f10, f11.
-    assert [photo.name for photo in scene.train] == [f"images/f{k}.png" for k in (8, 9, 10, 11)]
-    assert len({id(photo.camera) for photo in scene.train}) == 1
-    for photo, matrix in zip(scene.train, matrices(4), strict=True):
-        pixel = image_from_cam(photo.camera, photo.cam_from_world.apply(POINT[None]))[0]
+    assert list(photos.names) == [f"images/f{k}.png" for k in (8, 9, 10, 11)]
+    assert len(photos.cameras) == 1
+    for v, matrix in enumerate(matrices(4)):
+        pixel = image_from_cam(photos.cameras[0], photos.pose_of(v).apply(POINT[None]))[0]
         np.testing.assert_allclose(pixel, pixel_by_definition(matrix, *definition), rtol=1e-9)
 
 
 def test_a_frame_may_have_a_camera_of_its_own(tmp_path):
     frames: list[dict[str, Any]] = [{}, {"fl_x": 60.0, "fl_y": 60.0}, {}, {"k1": 0.1}]
-    scene = read_transforms(write_scene(tmp_path, {"fl_x": 50, "fl_y": 50}, frames))
-    assert [photo.camera.model for photo in scene.train] == ["PINHOLE", "PINHOLE", "PINHOLE", "OPENCV"]
-    assert [photo.camera.params[0] for photo in scene.train] == [50, 60, 50, 50]
-    assert scene.train[0].camera is scene.train[2].camera
+    photos = read_transforms(write_scene(tmp_path, {"fl_x": 50, "fl_y": 50}, frames)).photos
+    assert [camera.model for camera in photos.cameras] == ["PINHOLE", "PINHOLE", "OPENCV"]
+    assert [camera.params[0] for camera in photos.cameras] == [50, 60, 50]
+    assert photos.camera_of_photo.tolist() == [0, 1, 0, 2]
 
 
 def test_fisheye_coefficients_are_those_of_the_fisheye(tmp_path):
@@ -102,7 +103,7 @@ def test_fisheye_coefficients_are_those_of_the_fisheye(tmp_path):
     angle = np.arctan(r)
     distorted = angle * (1 + 0.1 * angle**2 + 0.02 * angle**4 + 0.01 * angle**6 - 0.01 * angle**8)
     expected = np.array([30 * u * distorted / r + 20, 30 * v * distorted / r + 15])
-    camera, pose = scene.train[0].camera, scene.train[0].cam_from_world
+    camera, pose = scene.photos.camera_of(0), scene.photos.pose_of(0)
     np.testing.assert_allclose(image_from_cam(camera, pose.apply(POINT[None]))[0], expected, rtol=1e-9)
 
 
@@ -121,9 +122,8 @@ def test_splits_points_and_boxes_are_read(tmp_path):
     xyz = np.random.default_rng(0).normal(size=(5, 3))
     write_points(Points(xyz, np.zeros((5, 3), dtype=np.uint8)), tmp_path / "points.ply")
     scene = read_transforms(write_scene(tmp_path, top))
-    assert [photo.name for photo in scene.train] == ["images/f8.png", "images/f10.png"]
-    assert scene.test is not None
-    assert [photo.name for photo in scene.test] == ["images/f11.png"]
+    assert scene.photos.select(scene.splits["train"]).names == ("images/f8.png", "images/f10.png")
+    assert scene.photos.select(scene.held_out()).names == ("images/f11.png",)
     np.testing.assert_array_equal(scene.points_in_world, xyz)
     # position * scale + offset lies in the unit cube.
     assert scene.box is not None
@@ -133,7 +133,7 @@ def test_splits_points_and_boxes_are_read(tmp_path):
 def test_comments_and_suffixes_left_out_are_understood(tmp_path):
     path = write_scene(tmp_path, {"fl_x": 50})
     path.write_text("// made by hand\n" + path.read_text().replace(".png", ""))
-    assert len(read_transforms(path).train) == 4
+    assert len(read_transforms(path).photos) == 4
     assert find_transforms(tmp_path) == path
     assert find_transforms(path) == path
     assert find_transforms(tmp_path / "images") is None
@@ -171,9 +171,9 @@ def test_random_damage_is_refused_or_understood(tmp_path):
     path = write_scene(tmp_path, {"fl_x": 50, "aabb_scale": 1})
 
     def check(scene):
-        assert scene.train
-        for photo in scene.train:
-            assert np.isfinite(photo.camera.params).all()
+        assert len(scene.photos)
+        for camera in scene.photos.cameras:
+            assert np.isfinite(camera.params).all()
 
     loaded, refused = check_mutations(path, lambda: read_transforms(path), check, count=150)
     assert loaded

@@ -7,24 +7,25 @@ import pytest
 
 from fieldstone.cli import main
 from fieldstone.errors import InputError
+from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.images.photos import write_photo
 from fieldstone.run import fast_fields
 from fieldstone.run.fast_fields import train_fast_run
-from grid_scenes import ball_images
+from grid_scenes import ball_photos
 
 STEPS = {"finest": 24, "steps": [6] * 8, "num_chunks": 2, "samples_per_chunk": 256}
 
 
-def write_scene(folder, *, edit=lambda images: [image.pixels for image in images], poses=None):
+def write_scene(folder, *, edit=lambda pixels: pixels, poses=None):
     """Ten photos of a ball as a transforms.json, with pixels that a test may change."""
-    images = ball_images(10)
+    photos = ball_photos(10)
     frames = []
-    for k, (image, pixels) in enumerate(zip(images, edit(images), strict=True)):
+    for k, (name, pixels) in enumerate(zip(photos.posed.names, edit(photos.pixels), strict=True)):
         if pixels is not None:
-            write_photo(folder / f"{image.name}.png", pixels)
-        pose = image.cam_from_world if poses is None else poses[k]
+            write_photo(folder / f"{name}.png", pixels)
+        pose = photos.posed.pose_of(k) if poses is None else poses[k]
         matrix = pose.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{image.name}.png", "transform_matrix": matrix.tolist()})
+        frames.append({"file_path": f"{name}.png", "transform_matrix": matrix.tolist()})
     (folder / "plan.json").write_text(json.dumps(STEPS))
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
     return folder
@@ -34,20 +35,20 @@ def train(folder, **options):
     return train_fast_run(folder, folder / "out", plan=folder / "plan.json", threads=1, **options)
 
 
-def one_color(images):
-    return [np.full_like(image.pixels[..., :3], 77) for image in images]
+def one_color(photos):
+    return [np.full_like(pixels[..., :3], 77) for pixels in photos]
 
 
-def mixed_alpha(images):
-    return [image.pixels if k % 2 else image.pixels[..., :3] for k, image in enumerate(images)]
+def mixed_alpha(photos):
+    return [pixels if k % 2 else pixels[..., :3] for k, pixels in enumerate(photos)]
 
 
-def some_missing(images):
-    return [None if k in (2, 3) else image.pixels for k, image in enumerate(images)]
+def some_missing(photos):
+    return [None if k in (2, 3) else pixels for k, pixels in enumerate(photos)]
 
 
-def several_sizes(images):
-    return [image.pixels if k % 2 else image.pixels[::2, ::2] for k, image in enumerate(images)]
+def several_sizes(photos):
+    return [pixels if k % 2 else pixels[::2, ::2] for k, pixels in enumerate(photos)]
 
 
 @pytest.mark.parametrize("edit", [one_color, mixed_alpha, some_missing, several_sizes])
@@ -60,23 +61,23 @@ def test_odd_photos_still_make_a_field(tmp_path, edit):
 
 
 def test_photos_of_one_pixel_are_refused(tmp_path):
-    folder = write_scene(tmp_path, edit=lambda images: [image.pixels[:1, :1] for image in images])
+    folder = write_scene(tmp_path, edit=lambda photos: [pixels[:1, :1] for pixels in photos])
     with pytest.raises(InputError, match="smaller than 11"):
         train(folder)
 
 
 def test_photos_without_a_common_place_are_refused_or_learned(tmp_path):
     """Cameras side by side that look the same way: their axes never meet."""
-    images = ball_images(10)
-    pose = images[0].cam_from_world
-    poses = [type(pose)(pose.R, pose.t + [0.5 * k, 0.0, 0.0]) for k in range(10)]
-    metrics = train(write_scene(tmp_path, edit=lambda images: [i.pixels[..., :3] for i in images], poses=poses))
+    photos = ball_photos(10)
+    pose = photos.posed.pose_of(0)
+    poses = [Rigid3(pose.R, pose.t + [0.5 * k, 0.0, 0.0]) for k in range(10)]
+    metrics = train(write_scene(tmp_path, edit=lambda photos: [pixels[..., :3] for pixels in photos], poses=poses))
     assert np.isfinite(metrics["psnr"])
 
 
 def test_cameras_at_one_place_are_refused(tmp_path):
-    images = ball_images(10)
-    poses = [type(image.cam_from_world)(image.cam_from_world.R, np.zeros(3)) for image in images]
+    photos = ball_photos(10)
+    poses = [Rigid3(pose.R, np.zeros(3)) for pose in photos.posed.cam_from_world]
     with pytest.raises(InputError, match="one place"):
         train(write_scene(tmp_path, poses=poses))
 

@@ -1,6 +1,5 @@
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +10,11 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.images.photos import write_photo
-from fieldstone.io.posed.posed_photos import PosedPhoto
 from fieldstone.run import fast_fields, fast_stages
 from fieldstone.run.fast_fields import size_in_memory, train_fast_run
 from fieldstone.run.fields import split_tensors
-from grid_scenes import ball_images
+from fieldstone.scene.photos import posed_photos
+from grid_scenes import ball_photos
 
 CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 1500.0]))
 
@@ -24,17 +23,18 @@ CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 15
 def ball_folder(tmp_path_factory):
     """The ball in the Blender format: 9 photos to train on, one to test."""
     folder = tmp_path_factory.mktemp("ball")
-    images = ball_images(10)
-    camera = images[0].camera
+    photos = ball_photos(10)
+    camera = photos.posed.camera_of(0)
     angle = 2 * np.arctan(0.5 * camera.width / camera.focal[0])
-    for split, part in {"train": images[1:], "test": images[:1]}.items():
+    for split, part in {"train": range(1, 10), "test": range(1)}.items():
         frames = []
-        for image in part:
-            write_photo(folder / split / f"{image.name}.png", image.pixels)
+        for v in part:
+            name, pose = photos.posed.names[v], photos.posed.pose_of(v)
+            write_photo(folder / split / f"{name}.png", photos.pixels[v])
             world_from_cam = np.eye(4)
-            world_from_cam[:3, :3] = image.cam_from_world.R.T @ np.diag([1.0, -1, -1])
-            world_from_cam[:3, 3] = image.cam_from_world.target_origin_in_source()
-            frames.append({"file_path": f"./{split}/{image.name}", "transform_matrix": world_from_cam.tolist()})
+            world_from_cam[:3, :3] = pose.R.T @ np.diag([1.0, -1, -1])
+            world_from_cam[:3, 3] = pose.target_origin_in_source()
+            frames.append({"file_path": f"./{split}/{name}", "transform_matrix": world_from_cam.tolist()})
         (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return folder
 
@@ -123,10 +123,12 @@ def test_refined_poses_stay_refined_when_a_run_goes_on(ball_folder, tmp_path):
 
 
 def test_photos_are_as_large_as_memory_allows():
-    photos = [PosedPhoto(f"{k}.jpg", Path(f"{k}.jpg"), CAMERA_12_MP, Rigid3(np.eye(3), np.zeros(3))) for k in range(20)]
+    photos = posed_photos(
+        [f"{k}" for k in range(20)], [CAMERA_12_MP], np.zeros(20, int), Rigid3.stack([Rigid3.identity()] * 20)
+    )
     size = size_in_memory(photos, 4.0)
     assert 36 * 20 * size * (0.75 * size) == pytest.approx(0.75 * 4 * 2**30, rel=1e-2)
-    assert size_in_memory(photos[:1], 4.0) == 4000
+    assert size_in_memory(photos.select([0]), 4.0) == 4000
     assert size_in_memory(photos, 1e-6) == 200
 
 

@@ -10,20 +10,20 @@ from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
 from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.images.photos import write_photo
 from fieldstone.io.shapes.ply import write_points
-from fieldstone.run.field_input import open_field_input, read_ray_dataset
+from fieldstone.run.field_input import frame_of, open_field_input, read_ray_dataset
 from fieldstone.scene.reconstruction import Points
-from grid_scenes import ball_images
+from grid_scenes import ball_photos
 
 
 def write_transforms(folder, *, alpha, **top):
     """The ball, radius 0.8 at the origin, photographed from around."""
     frames = []
-    images = ball_images(9)
-    for image in images:
-        write_photo(folder / f"{image.name}.png", image.pixels if alpha else image.pixels[..., :3])
-        matrix = image.cam_from_world.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{image.name}.png", "transform_matrix": matrix.tolist()})
-    camera = images[0].camera
+    photos = ball_photos(9)
+    for v, (name, pixels) in enumerate(zip(photos.posed.names, photos.pixels, strict=True)):
+        write_photo(folder / f"{name}.png", pixels if alpha else pixels[..., :3])
+        matrix = photos.posed.pose_of(v).inverse().matrix() @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{name}.png", "transform_matrix": matrix.tolist()})
+    camera = photos.posed.camera_of(0)
     content = {"fl_x": camera.focal[0], "w": camera.width, "h": camera.height, **top, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder
@@ -33,8 +33,8 @@ def write_transforms(folder, *, alpha, **top):
 def test_every_eighth_photo_of_a_file_without_split_is_held_out(tmp_path, as_file):
     folder = write_transforms(tmp_path, alpha=True)
     dataset = read_ray_dataset(folder / "transforms.json" if as_file else folder, None, 100)
-    assert [image.name for image in dataset.test] == ["r_0.png", "r_8.png"]
-    assert [image.name for image in dataset.train] == [f"r_{k}.png" for k in range(1, 8)]
+    assert list(dataset.test.posed.names) == ["r_0.png", "r_8.png"]
+    assert list(dataset.train.posed.names) == [f"r_{k}.png" for k in range(1, 8)]
 
 
 @pytest.mark.parametrize(
@@ -42,8 +42,8 @@ def test_every_eighth_photo_of_a_file_without_split_is_held_out(tmp_path, as_fil
 )
 def test_other_photos_are_held_out_on_request(tmp_path, names, tested):
     dataset = read_ray_dataset(write_transforms(tmp_path, alpha=True), None, 100, hold_out=names)
-    assert sorted(image.name for image in dataset.test) == sorted(f"r_{k}.png" for k in tested)
-    assert {image.name for image in dataset.train} == {f"r_{k}.png" for k in range(9) if k not in tested}
+    assert sorted(dataset.test.posed.names) == sorted(f"r_{k}.png" for k in tested)
+    assert set(dataset.train.posed.names) == {f"r_{k}.png" for k in range(9) if k not in tested}
 
 
 def test_a_photo_to_hold_out_that_is_not_there_is_named(tmp_path):
@@ -67,7 +67,7 @@ def test_photos_with_alpha_show_an_object_in_a_box(tmp_path):
 def test_photos_without_alpha_show_a_scene_without_bounds(tmp_path):
     dataset = read_ray_dataset(write_transforms(tmp_path, alpha=False), None, 100)
     assert not dataset.bounded
-    mean = np.mean([image.pixels.reshape(-1, 3).mean(axis=0) for image in dataset.train], axis=0) / 255
+    mean = np.mean([pixels.reshape(-1, 3).mean(axis=0) for pixels in dataset.train.pixels], axis=0) / 255
     np.testing.assert_allclose(dataset.frame.background, mean)
     # The ball is inside of the box, and the cameras are outside.
     assert 0.8 * dataset.frame.normalized_from_world.scale < NORMALIZED_RADIUS
@@ -89,14 +89,15 @@ def test_points_of_a_file_give_the_range(tmp_path):
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     folder = write_transforms(tmp_path, alpha=False, ply_file_path="points.ply")
     write_points(Points(points, np.zeros((300, 3), dtype=np.uint8)), folder / "points.ply")
-    given = open_field_input(folder)
-    assert not given.bounded
-    assert given.frame is not None
-    scale = given.frame.normalized_from_world.scale
+    found = frame_of(open_field_input(folder), np.zeros(3))
+    assert found is not None
+    frame, bounded = found
+    assert not bounded
+    scale = frame.normalized_from_world.scale
     assert scale == pytest.approx(NORMALIZED_RADIUS / 0.8, rel=0.1)
     # Cameras stand 3.2 to 3.6 away from the middle.
-    assert (3.2 - 0.8) * 0.75 < given.frame.near / scale < 3.2 - 0.8
-    assert 3.2 + 0.5 < given.frame.far / scale < (3.6 + 0.8) * 1.3
+    assert (3.2 - 0.8) * 0.75 < frame.near / scale < 3.2 - 0.8
+    assert 3.2 + 0.5 < frame.far / scale < (3.6 + 0.8) * 1.3
 
 
 def test_llff_scenes_look_ahead(tmp_path):
@@ -109,7 +110,7 @@ def test_llff_scenes_look_ahead(tmp_path):
         write_photo(tmp_path / "images" / f"p{k}.png", np.full((30, 40, 3), 20 * k, dtype=np.uint8))
     np.save(tmp_path / "poses_bounds.npy", np.array(rows))
     dataset = read_ray_dataset(tmp_path, None, 100)
-    assert [image.name for image in dataset.test] == ["p0.png", "p8.png"]
+    assert list(dataset.test.posed.names) == ["p0.png", "p8.png"]
     assert not dataset.bounded
     scale = dataset.frame.normalized_from_world.scale
     assert dataset.frame.near / scale == pytest.approx(0.8 * 2.0, rel=0.2)
@@ -127,7 +128,7 @@ def test_a_photo_that_cannot_be_read_is_left_out(tmp_path, caplog):
     folder = write_transforms(tmp_path, alpha=True)
     data = (folder / "r_3.png").read_bytes()
     (folder / "r_3.png").write_bytes(data[: len(data) // 2])
-    names = [image.name for image in read_ray_dataset(folder, None, 100).train]
+    names = read_ray_dataset(folder, None, 100).train.posed.names
     assert "r_3.png" not in names
     assert len(names) == 6
     assert "r_3.png" in caplog.text

@@ -12,20 +12,20 @@ from fieldstone.io.shapes.ply import read_points
 from fieldstone.run.fast_fields import train_fast_run
 from fieldstone.run.mesh import mesh_run
 from fieldstone.run.splats import splat_run
-from grid_scenes import RADIUS, ball_images
+from grid_scenes import RADIUS, ball_photos
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A field of the ball, from a transforms.json."""
     folder = tmp_path_factory.mktemp("ball")
-    images = ball_images(24, heights=(0.3, 2.4, -2.2))
+    photos = ball_photos(24, heights=(0.3, 2.4, -2.2))
     frames = []
-    for image in images:
-        write_photo(folder / f"{image.name}.png", image.pixels)
-        matrix = image.cam_from_world.inverse().matrix() @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": image.name, "transform_matrix": matrix.tolist()})
-    (folder / "transforms.json").write_text(json.dumps({"fl_x": images[0].camera.focal[0], "frames": frames}))
+    for v, name in enumerate(photos.posed.names):
+        write_photo(folder / f"{name}.png", photos.pixels[v])
+        matrix = photos.posed.pose_of(v).inverse().matrix() @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": photos.posed.camera_of(0).focal[0], "frames": frames}))
     plan = {"finest": 48, "steps": [40] * 8, "num_chunks": 2, "samples_per_chunk": 1024}
     (folder / "plan.json").write_text(json.dumps(plan))
     train_fast_run(folder, folder / "out", plan=folder / "plan.json", threads=2)

@@ -205,12 +205,12 @@ def test_train_on_a_reconstruction(tmp_path):
 
 def test_dataset_of_a_reconstruction(tmp_path):
     source, photos = write_colmap_folder(tmp_path / "in", tmp_path / "photos"), tmp_path / "photos"
-    with pytest.raises(InputError, match="--photos"):
+    with pytest.raises(InputError, match="photos of the model are in none of"):
         read_ray_dataset(source, None, 100)
     (photos / "p3.png").unlink()
     (photos / "p4.png").write_bytes(b"no photo")
     dataset = read_ray_dataset(source, photos, 100)
-    assert [image.name for image in dataset.train] == ["p1.png", "p2.png", "p5.png", "p6.png", "p7.png", "p8.png"]
+    assert list(dataset.train.posed.names) == ["p1.png", "p2.png", "p5.png", "p6.png", "p7.png", "p8.png"]
     assert len(dataset.points_in_world) == 40
     # The ball has radius 3 and the cameras are 12.5 away: its front is within the range of the rays.
     scale = dataset.frame.normalized_from_world.scale

@@ -8,14 +8,14 @@ import pytest
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
-from fieldstone.field.grid_training.plan import first_plan
+from fieldstone.field.grid_training.budget import first_plan
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
 from fieldstone.run.fast_fields import train_fast_run
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
-from grid_scenes import CAMERA, RADIUS, ball_images
+from grid_scenes import CAMERA, RADIUS, ball_photos
 
 WHITE_ROWS = 24
 
@@ -24,26 +24,27 @@ WHITE_ROWS = 24
 def ball_model(tmp_path_factory):
     """A model of the ball before black, photographed nine times, and masks that leave the lower rows out."""
     folder, rng = tmp_path_factory.mktemp("model"), np.random.default_rng(0)
-    images = ball_images(9)
+    photos = ball_photos(9)
+    names = photos.posed.names
     xyz = rng.normal(size=(400, 3))
     xyz *= RADIUS / np.linalg.norm(xyz, axis=1, keepdims=True)
     rows = []
     mask = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
     mask[:WHITE_ROWS] = 255
-    for v, image in enumerate(images):
-        rgb = np.where(image.pixels[..., 3:] > 127, image.pixels[..., :3], 20)
-        write_photo(folder / "images" / f"{image.name}.png", rgb.astype(np.uint8))
-        write_photo(folder / "white" / f"{image.name}.png", mask)
-        facing = np.einsum("ni,ni->n", xyz, image.cam_from_world.target_origin_in_source() - xyz) > 0.3
-        pixels = image_from_cam(CAMERA, image.cam_from_world.apply(xyz))
+    for v, (name, rgba) in enumerate(zip(names, photos.pixels, strict=True)):
+        rgb = np.where(rgba[..., 3:] > 127, rgba[..., :3], 20)
+        write_photo(folder / "images" / f"{name}.png", rgb.astype(np.uint8))
+        write_photo(folder / "white" / f"{name}.png", mask)
+        facing = np.einsum("ni,ni->n", xyz, photos.posed.centers()[v] - xyz) > 0.3
+        pixels = image_from_cam(CAMERA, photos.posed.pose_of(v).apply(xyz))
         rows += [(p, v, *pixels[p]) for p in np.flatnonzero(facing)]
     point, view, x, y = (np.array(column) for column in zip(*sorted(rows), strict=True))
     keypoint = np.zeros(len(point), dtype=np.int64)
-    for v in range(len(images)):
+    for v in range(len(photos)):
         keypoint[view == v] = np.arange(np.count_nonzero(view == v))
     model = Reconstruction(
         (CAMERA,),
-        tuple(View(f"{image.name}.png", 0, image.cam_from_world) for image in images),
+        tuple(View(f"{name}.png", 0, photos.posed.pose_of(v)) for v, name in enumerate(names)),
         Points(xyz, np.zeros((400, 3), np.uint8)),
         Observations(view, keypoint, point, np.stack([x, y], axis=1)),
     )

@@ -21,28 +21,27 @@ from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import quantize
 from fieldstone.field.base.radiance_field import FieldFrame, FieldTraining, in_world
-from fieldstone.field.base.ray_dataset import PosedImage, RayDataset, reduce_image
+from fieldstone.field.base.ray_dataset import RayDataset, reduced_size
 from fieldstone.field.base.training import CurvePoint, OnStep
 from fieldstone.field.grid.exposure import gain_at
 from fieldstone.field.grid_training.budget import finest_for, first_plan, plan_for_budget
 from fieldstone.field.grid_training.plan import NUM_STAGES, GridPlan, Schedule, plan_from_json
 from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.field.grid_training.training import GridTraining
-from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.camera import Camera, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.files.atomic import write_json, write_text
 from fieldstone.io.files.checkpoint import write_checkpoint
 from fieldstone.io.images.photos import write_photo
-from fieldstone.io.posed.posed_photos import PosedPhoto
 from fieldstone.render.views import render_view
 from fieldstone.run.fast_stages import PlannedState, measured_step, train_stages
 from fieldstone.run.field_input import (
     check_sizes,
     dataset_of,
+    decode_photos,
     holding_out,
     open_field_input,
-    read_images,
     with_masks,
 )
 from fieldstone.run.fields import (
@@ -57,6 +56,8 @@ from fieldstone.run.fields import (
     torch_for,
     write_field_report,
 )
+from fieldstone.scene.photos import DecodedPhotos, PosedPhotos, posed_photos
+from fieldstone.scene.rays import rays_from_view
 
 logger = logging.getLogger(__name__)
 
@@ -132,10 +133,12 @@ def train_fast_run(
         compile_kernels(executor, steps_by)
         started = time.perf_counter()
         on_stage("reading photos")
-        given_photos = with_masks(holding_out(open_field_input(source, photos), hold_out), masks, source)
-        size_px = size_px or size_in_memory(given_photos.train, memory_gib)
-        check_sizes(given_photos.test)
-        dataset = dataset_of(given_photos, size_px, held_out=False)
+        scene = open_field_input(source, photos)
+        split = holding_out(scene, hold_out)
+        scene = with_masks(scene, split, masks, source)
+        size_px = size_px or size_in_memory(scene.photos.select(split.train), memory_gib)
+        check_sizes(scene.photos.select(split.test))
+        dataset = dataset_of(scene, split, size_px, held_out=False)
         header = run_header("fast", {"use_alpha": use_alpha}, seed, dataset)
         opened = _open(dataset, given, budget_s, use_alpha, refine_poses, seed, executor, memory_gib)
         if given is None:
@@ -145,7 +148,7 @@ def train_fast_run(
         training = steps_by(opened)
         state, curve = resume_or_start(training, out, header)
         trained_before = curve[-1].seconds if curve else 0.0
-        views = scene_tensors(dataset.train)
+        views = scene_tensors(dataset.train.posed.cam_from_world)
 
         def save(state: PlannedState, curve: tuple[CurvePoint, ...]) -> None:
             write_json(out / CURVE, [asdict(point) for point in curve])
@@ -153,8 +156,9 @@ def train_fast_run(
             write_checkpoint(out / CHECKPOINT, {**views, **prefixed(training.to_tensors(state))}, header)
 
         def preview(state: PlannedState) -> None:
-            image = reduce_image(dataset.train[0], PREVIEW_SIZE_PX)
-            view = render_view(in_world(training.renderer(state), dataset.frame), image.camera, image.cam_from_world)
+            camera, pose = dataset.train.posed.camera_of(0), dataset.train.posed.pose_of(0)
+            camera = rescale(camera, *reduced_size(camera.width, camera.height, PREVIEW_SIZE_PX))
+            view = render_view(in_world(training.renderer(state), dataset.frame), camera, pose)
             write_photo(out / PREVIEW, quantize(view.rgb))
 
         on_stage("training")
@@ -164,7 +168,7 @@ def train_fast_run(
         )
         elapsed = time.perf_counter() - started
         on_stage("rendering held-out views")
-        dataset = replace(dataset, test=read_images(given_photos.test, size_px))
+        dataset = replace(dataset, test=decode_photos(scene.photos.select(split.test), size_px)[0])
         shown = in_world(training.renderer(state), dataset.frame)
         metrics = evaluate_views(shown, dataset, out / "renders" / "test", exposure_near(dataset, state))
     metrics |= {
@@ -199,13 +203,12 @@ def steps_on(device: str) -> StepsBy:
     return lambda training: TorchGridTraining(training, found)
 
 
-def exposure_near(dataset: RayDataset, state: PlannedState) -> Callable[[PosedImage], np.ndarray] | None:
+def exposure_near(dataset: RayDataset, state: PlannedState) -> Callable[[Rigid3], np.ndarray] | None:
     """The exposure that a held-out view is shown with, from the training photos near it; None: none was learned."""
     if state.plan.rates.exposure_rate == 0:
         return None
     log_gain = state.exposure.log_gain.astype(np.float64).reshape(-1, 3)
-    poses = Rigid3.stack([image.cam_from_world for image in dataset.train])
-    return lambda image: gain_at(log_gain, image.cam_from_world, poses)
+    return lambda cam_from_world: gain_at(log_gain, cam_from_world, dataset.train.posed.cam_from_world)
 
 
 def compile_kernels(executor: Executor, steps_by: StepsBy = lambda training: training) -> None:
@@ -213,21 +216,16 @@ def compile_kernels(executor: Executor, steps_by: StepsBy = lambda training: tra
     camera = Camera("SIMPLE_PINHOLE", 12, 12, np.array([14.0, 6.0, 6.0]))
     pixels = np.full((12, 12, 4), 255, dtype=np.uint8)
     pixels[:3], pixels[:, :3] = 0, 0
-    image = PosedImage("compile", camera, Rigid3(np.eye(3), np.array([0.0, 0, 4])), pixels)
+    pose = Rigid3(np.eye(3), np.array([0.0, 0, 4]))
+    posed = posed_photos(["compile"], [camera], np.zeros(1, dtype=np.int64), Rigid3.stack([pose]))
+    photos = DecodedPhotos(posed, (pixels,), (None,))
     frame = FieldFrame(Sim3(1.0, np.eye(3), np.zeros(3)), 2.0, 6.0, np.ones(3))
     plan = GridPlan(Schedule(finest=64, steps=(1,) * NUM_STAGES)).replaced(num_chunks=1, samples_per_chunk=256)
-    training = steps_by(prepare_grid_training((image,), frame, plan, seed=0, executor=executor))
+    training = steps_by(prepare_grid_training(photos, frame, plan, seed=0, executor=executor))
     state = training.start()
     for _ in range(plan.schedule.total_steps):
         state, _ = training.advance(state)
-    training.renderer(state)(training_view(image))
-
-
-def training_view(image: PosedImage) -> Any:
-    """The rays of a training photo."""
-    from fieldstone.scene.rays import rays_from_view
-
-    return rays_from_view(image.camera, image.cam_from_world)
+    training.renderer(state)(rays_from_view(camera, pose))
 
 
 def _open(
@@ -257,8 +255,9 @@ def _open(
     if given is not None:
         return training
     world = dataset.frame.normalized_from_world
-    distances = [np.linalg.norm(world.apply(image.cam_from_world.target_origin_in_source())) for image in dataset.train]
-    focal = float(np.median([np.mean(image.camera.focal) for image in dataset.train]))
+    posed = dataset.train.posed
+    distances = [np.linalg.norm(world.apply(center)) for center in posed.centers()]
+    focal = float(np.median([np.mean(posed.camera_of(v).focal) for v in range(len(posed))]))
     extent = float(np.max(training.occupancy.extent))
     pixel_size = float(np.median(distances) / focal)
     if training.space.is_projective:
@@ -266,14 +265,14 @@ def _open(
     finest = finest_for(budget_s, extent, pixel_size)
     if training.space.is_contracted:
         finest = min(2 * finest, MAX_UNBOUNDED)
-    finest = min(finest, _finest_in_memory(training, dataset.train, memory_gib))
+    finest = min(finest, _finest_in_memory(training, sum(p.nbytes for p in dataset.train.pixels), memory_gib))
     plan = first_plan(finest, budget_s, bounded=not training.space.is_open)
     return replace(training, plan=plan.replaced(refine_poses=refine_poses))
 
 
-def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
+def size_in_memory(photos: PosedPhotos, memory_gib: float) -> int:
     """Pixels along the longer side of the photos whose rays leave room for grids."""
-    cameras = [photo.camera for photo in photos]
+    cameras = [photos.camera_of(v) for v in range(len(photos))]
     pixels = sum(camera.width * camera.height for camera in cameras)
     share = RAYS_SHARE * memory_gib * 2**30 / (BYTES_PER_PIXEL * max(pixels, 1))
     longest = max((max(camera.width, camera.height) for camera in cameras), default=MAX_SIZE_PX)
@@ -283,7 +282,7 @@ def size_in_memory(photos: Sequence[PosedPhoto], memory_gib: float) -> int:
     return size
 
 
-def _finest_in_memory(training: GridTraining, images: Sequence[PosedImage], memory_gib: float) -> int:
+def _finest_in_memory(training: GridTraining, photo_bytes: int, memory_gib: float) -> int:
     """Cells along the longest side whose grids fit beside the photos and their rays.
 
     A vertex of the finest level has 32 bytes of values and velocities, all coarser levels add a seventh and their
@@ -294,7 +293,7 @@ def _finest_in_memory(training: GridTraining, images: Sequence[PosedImage], memo
     """
     rays = training.rays
     used = sum(array.nbytes for array in (rays.image, rays.bearing, rays.rgba, rays.bearings, rays.free_distance))
-    used += sum(image.pixels.nbytes for image in images)
+    used += photo_bytes
     left = memory_gib * 2**30 - used
     extent = training.occupancy.extent / np.max(training.occupancy.extent)
     finest = int(np.cbrt(max(left, 0.0) / (BYTES_PER_VERTEX * np.prod(extent))))

@@ -22,9 +22,8 @@ from fieldstone import __version__
 from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import PROTOCOL, psnr, quantize, ssim
 from fieldstone.field.base.radiance_field import FieldFrame, FieldTraining, RayRenderer, in_world
-from fieldstone.field.base.ray_dataset import PosedImage, RayDataset, training_rays
+from fieldstone.field.base.ray_dataset import RayDataset, training_rays
 from fieldstone.field.base.training import PRESETS, CurvePoint, OnStep, TrainOptions, train
-from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.io.files.atomic import write_json
@@ -93,7 +92,7 @@ def train_run(
     with open_training(options, dataset.frame, dataset, seed=seed, device=device, threads=threads) as training:
         state, curve = resume_or_start(training, out, header)
         on_stage("training")
-        views = scene_tensors(dataset.train)
+        views = scene_tensors(dataset.train.posed.cam_from_world)
 
         def save(state: Any, curve: tuple[CurvePoint, ...]) -> None:
             # The curve first: after a stop between the two it holds steps too many, which are dropped.
@@ -158,30 +157,31 @@ def evaluate_views(
     render_rays: RayRenderer,
     dataset: RayDataset,
     folder: Path,
-    exposure: Callable[[PosedImage], np.ndarray] | None = None,
+    exposure: Callable[[Rigid3], np.ndarray] | None = None,
 ) -> dict[str, Any]:
     """Render every held-out view to `folder`/NAME.png, and compare it with its photo, where its mask is white.
 
     Args:
-        exposure: Gain of each channel with which a view is shown; None: 1.
+        exposure: Gain of each channel with which a view from a pose (`cam_from_world`) is shown; None: 1.
     """
     views: dict[str, dict[str, float]] = {}
-    labels = view_labels([image.name for image in dataset.test])
-    for label, image in zip(labels, dataset.test, strict=True):
-        color = render_view(render_rays, image.camera, image.cam_from_world).rgb
-        rendered = quantize(color if exposure is None else color * exposure(image))
+    photos = dataset.test
+    for v, label in enumerate(view_labels(photos.posed.names)):
+        pose, keep = photos.posed.pose_of(v), photos.keep[v]
+        color = render_view(render_rays, photos.posed.camera_of(v), pose).rgb
+        rendered = quantize(color if exposure is None else color * exposure(pose))
         write_photo(folder / f"{label}.png", rendered)
-        photo = image.composited(dataset.frame.background)
+        photo = photos.composited(v, dataset.frame.background)
         as_written = rendered.astype(np.float32) / np.float32(255.0)
-        if image.keep is not None:
-            as_written = np.where(image.keep[..., None], as_written, photo)
-        share = 1.0 if image.keep is None else max(float(image.keep.mean()), 1e-9)
+        if keep is not None:
+            as_written = np.where(keep[..., None], as_written, photo)
+        share = 1.0 if keep is None else max(float(keep.mean()), 1e-9)
         # Equal pixels where the mask is black count nothing: the mean is over the others.
         found = psnr(as_written, photo) + 10.0 * np.log10(share)
         views[label] = {"psnr": float(min(found, MAX_PSNR)), "ssim": float(ssim(as_written, photo))}
-    sizes = sorted({(image.camera.width, image.camera.height) for image in dataset.test})
+    sizes = sorted({(camera.width, camera.height) for camera in photos.posed.cameras})
     background = ", ".join(f"{255 * c:.0f}" for c in dataset.frame.background)
-    masked = any(image.keep is not None for image in dataset.test)
+    masked = any(keep is not None for keep in photos.keep)
     return {
         "psnr": float(np.mean([view["psnr"] for view in views.values()])) if views else None,
         "ssim": float(np.mean([view["ssim"] for view in views.values()])) if views else None,
@@ -197,12 +197,12 @@ def evaluate_views(
 
 def write_field_report(out: Path, dataset: RayDataset, curve: Sequence[CurvePoint], metrics: Mapping[str, Any]) -> None:
     """Add the training curve and rendered beside true views to the report of the folder."""
-    images = dict(zip(view_labels([image.name for image in dataset.test]), dataset.test, strict=True))
+    index = {label: v for v, label in enumerate(view_labels(dataset.test.posed.names))}
     found = from_json(FieldMetrics, metrics, METRICS)
     figures = field_figures(
         curve,
         lambda label: read_photo(out / "renders" / "test" / f"{label}.png").rgb,
-        lambda label: np.rint(255.0 * images[label].composited(dataset.frame.background)).astype(np.uint8),
+        lambda label: np.rint(255.0 * dataset.test.composited(index[label], dataset.frame.background)).astype(np.uint8),
         found.views,
     )
     folder = RunFolder(out)
@@ -212,13 +212,7 @@ def write_field_report(out: Path, dataset: RayDataset, curve: Sequence[CurvePoin
 
 def run_header(field: str, options: Mapping[str, Any], seed: int, dataset: RayDataset) -> dict[str, Any]:
     """What a checkpoint says of its run; equal headers mean that training can go on."""
-    frame = dataset.frame
-    cameras: list[Camera] = []
-    camera_of_view = []
-    for image in dataset.train:
-        if not any(image.camera is camera for camera in cameras):
-            cameras.append(image.camera)
-        camera_of_view.append(next(k for k, camera in enumerate(cameras) if camera is image.camera))
+    frame, posed = dataset.frame, dataset.train.posed
     return {
         "field": field,
         "options": dict(options),
@@ -232,32 +226,32 @@ def run_header(field: str, options: Mapping[str, Any], seed: int, dataset: RayDa
             "far": frame.far,
             "background": frame.background.tolist(),
         },
-        "names": [image.name for image in dataset.train],
+        "names": list(posed.names),
         "cameras": [
-            {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in cameras
+            {"model": c.model, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in posed.cameras
         ],
-        "camera_of_view": camera_of_view,
+        "camera_of_view": posed.camera_of_photo.tolist(),
     }
 
 
 def fingerprint(dataset: RayDataset) -> str:
     """SHA-256 of the training photos as they are used, with names and poses."""
     digest = hashlib.sha256()
-    for image in dataset.train:
-        digest.update(f"{image.name}\n{image.pixels.shape}\n".encode())
-        arrays = [image.pixels, image.camera.params, image.cam_from_world.R, image.cam_from_world.t]
-        seen = dataset.seen.get(image.name)
-        arrays += [] if image.keep is None else [image.keep]
+    photos, posed = dataset.train, dataset.train.posed
+    for v, name in enumerate(posed.names):
+        digest.update(f"{name}\n{photos.pixels[v].shape}\n".encode())
+        arrays = [photos.pixels[v], posed.camera_of(v).params, posed.pose_of(v).R, posed.pose_of(v).t]
+        keep, seen = photos.keep[v], dataset.seen[v] if dataset.seen else None
+        arrays += [] if keep is None else [keep]
         arrays += [] if seen is None else [seen.xyz, seen.sigma]
         for array in arrays:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-def scene_tensors(images: tuple[PosedImage, ...]) -> dict[str, np.ndarray]:
+def scene_tensors(cam_from_world: Rigid3) -> dict[str, np.ndarray]:
     """Poses of the training views, for camera paths."""
-    poses = Rigid3.stack([image.cam_from_world for image in images])
-    return {"views.R": poses.R, "views.t": poses.t}
+    return {"views.R": cam_from_world.R, "views.t": cam_from_world.t}
 
 
 def frame_from_header(header: Mapping[str, Any]) -> FieldFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -66,9 +66,9 @@ class PosedPhotos:
         """Indices of the photos of each camera."""
         return [np.flatnonzero(self.camera_of_photo == k) for k in range(len(self.cameras))]
 
-    def select(self, photos: Iterable[int]) -> PosedPhotos:
+    def select(self, photos: Sequence[int] | Int[np.ndarray, "_"]) -> PosedPhotos:
         """The table of some photos, in the given order, with the cameras that they use."""
-        rows = np.fromiter((int(i) for i in photos), dtype=np.int64)
+        rows = np.array(photos, dtype=np.int64)
         return posed_photos(
             [self.names[i] for i in rows],
             self.cameras,
@@ -151,7 +151,7 @@ class DecodedPhotos:
         """Every photo has an alpha channel."""
         return all(pixels.shape[2] == 4 for pixels in self.pixels)
 
-    def select(self, photos: Iterable[int]) -> DecodedPhotos:
+    def select(self, photos: Sequence[int] | Int[np.ndarray, "_"]) -> DecodedPhotos:
         """Some photos, in the given order."""
         rows = [int(i) for i in photos]
         return DecodedPhotos(

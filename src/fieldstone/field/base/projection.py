@@ -10,15 +10,14 @@ from the plane z = near to the one at infinity, and is marched like any other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage
 from fieldstone.geometry.camera import bearings_from_image
+from fieldstone.scene.photos import PosedPhotos
 
 MAX_ANGLE_DEG = 65.0
 """No pixel may look further away from the mean axis."""
@@ -49,14 +48,14 @@ def no_projection() -> Projection:
 
 
 def projection_for(
-    images: Sequence[PosedImage], frame: FieldFrame, points_in_world: Float[np.ndarray, "p 3"]
+    photos: PosedPhotos, frame: FieldFrame, points_in_world: Float[np.ndarray, "p 3"]
 ) -> tuple[Projection, Float[np.ndarray, "2 3"]] | None:
     """The projective space of photos that look the same way, and the box of their rays; None if they do not.
 
     They do when every ray is within `MAX_ANGLE_DEG` of the mean axis and all cameras stand before the near plane.
     """
     world = frame.normalized_from_world
-    poses = [image.cam_from_world for image in images]
+    poses = [photos.pose_of(v) for v in range(len(photos))]
     axis = np.mean([world.R @ pose.R[2] for pose in poses], axis=0)
     right = np.mean([world.R @ pose.R[0] for pose in poses], axis=0)
     if np.linalg.norm(axis) < 0.5 or np.linalg.norm(right) < 0.5 or not len(points_in_world):
@@ -72,10 +71,11 @@ def projection_for(
     if near <= float(((centers - center) @ axis).max()) + 1e-6:
         return None
     corners = []
-    for image, camera_center in zip(images, centers, strict=True):
-        w, h = image.camera.width, image.camera.height
+    for v, camera_center in enumerate(centers):
+        camera = photos.camera_of(v)
+        w, h = camera.width, camera.height
         border = np.array([[x, y] for x in (0.5, w / 2, w - 0.5) for y in (0.5, h / 2, h - 0.5)])
-        directions = bearings_from_image(image.camera, border) @ image.cam_from_world.R @ world.R.T
+        directions = bearings_from_image(camera, border) @ poses[v].R @ world.R.T
         directions = directions[np.all(np.isfinite(directions), axis=1)]
         if np.any(directions @ axis < np.cos(np.deg2rad(MAX_ANGLE_DEG))):
             return None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -11,9 +11,10 @@ from scipy.sparse import csr_array
 
 from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.geometry.camera import Camera, bearings_from_image, rescale
+from fieldstone.geometry.camera import bearings_from_image, rescale
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.sim3 import Sim3
+from fieldstone.scene.photos import DecodedPhotos, composite_over
 from fieldstone.scene.rays import Rays, pixel_centers
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -30,43 +31,6 @@ NORMALIZED_RADIUS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class PosedImage:
-    """One photo with its camera and pose; RGB, or RGBA with straight alpha (sRGB, 8 bits)."""
-
-    name: str
-    camera: Camera
-    cam_from_world: Rigid3
-    pixels: UInt8[np.ndarray, "h w c"]
-    keep: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that say something of the scene; None: all."""
-
-    def __post_init__(self) -> None:
-        height, width, channels = self.pixels.shape
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise InputError(
-                f"{self.name}: the photo has {width}x{height} pixels, its camera says "
-                f"{self.camera.width}x{self.camera.height}; use photos of the size that the cameras were made with"
-            )
-        if channels not in (3, 4):
-            raise InputError(f"{self.name}: a photo needs 3 (RGB) or 4 (RGBA) channels, got {channels}")
-        if self.keep is not None and self.keep.shape != (height, width):
-            raise InputError(f"{self.name}: its mask has {self.keep.shape[1]}x{self.keep.shape[0]} pixels")
-
-    def composited(self, background: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 3"]:
-        """Colours in [0, 1] over a background, in sRGB; float32."""
-        return composite_over(self.pixels, background)
-
-
-def composite_over(pixels: UInt8[np.ndarray, "*n c"], background: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n 3"]:
-    """rgb a + background (1 - a) of RGBA pixels with straight alpha, rgb of RGB pixels; [0, 1], float32."""
-    rgb = pixels[..., :3].astype(np.float32) / np.float32(255.0)
-    if pixels.shape[-1] == 3:
-        return rgb
-    alpha = pixels[..., 3:].astype(np.float32) / np.float32(255.0)
-    return rgb * alpha + background.astype(np.float32) * (1.0 - alpha)
-
-
-@dataclass(frozen=True, eq=False)
 class SeenPoints:
     """Points in the world that one photo sees, and the standard deviations of their distances from it."""
 
@@ -76,21 +40,27 @@ class SeenPoints:
 
 @dataclass(frozen=True, eq=False)
 class RayDataset:
-    """The photos that a field learns from, those held out, and the frame in which it learns."""
+    """The photos that a field learns from, those held out, and the frame in which it learns.
 
-    train: tuple[PosedImage, ...]
-    test: tuple[PosedImage, ...]
+    Raises:
+        InputError: No photo to learn from.
+    """
+
+    train: DecodedPhotos
+    test: DecodedPhotos
     frame: FieldFrame
     points_in_world: Float[np.ndarray, "p 3"]
     """Triangulated points, none where only images and poses are known."""
     bounded: bool = True
     """Nothing lies beyond the cube of half side `NORMALIZED_RADIUS` around the origin of the frame."""
-    seen: Mapping[str, SeenPoints] = field(default_factory=dict)
-    """What each photo is known to see, by its name; may be empty."""
+    seen: tuple[SeenPoints | None, ...] = ()
+    """What each photo of `train` is known to see; empty: nothing is known of any."""
 
     def __post_init__(self) -> None:
-        if not self.train:
+        if not len(self.train):
             raise InputError("no photo to train on: all photos were held out or none has a pose")
+        if len(self.seen) not in (0, len(self.train)):
+            raise ValueError(f"{len(self.train)} photos to train on, but points of {len(self.seen)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,31 +111,29 @@ class TrainingRays:
         return composite_over(self.pixels[index], self.background)
 
 
-def training_rays(images: tuple[PosedImage, ...], frame: FieldFrame) -> TrainingRays:
-    """The table of all training pixels. Images that share a camera share its bearings."""
-    bearings, radii, pixels, image_rows, bearing_rows = [], [], [], [], []
-    first_bearing: dict[int, int] = {}
-    for v, image in enumerate(images):
-        if id(image.camera) not in first_bearing:
-            first_bearing[id(image.camera)] = sum(map(len, bearings))
-            in_cam = bearings_from_image(image.camera, pixel_centers(image.camera.width, image.camera.height))
-            bearings.append(in_cam)
-            radii.append(0.5 * in_cam[:, 2] / np.mean(image.camera.focal))
-        first = first_bearing[id(image.camera)]
-        rows = np.arange(first, first + image.camera.width * image.camera.height, dtype=np.int32)
-        bearing_rows.append(rows)
-        image_rows.append(np.full(len(rows), v, dtype=np.int32))
-        rgba = np.full((len(rows), 4), 255, dtype=np.uint8)
-        rgba[:, : image.pixels.shape[2]] = image.pixels.reshape(len(rows), -1)
+def training_rays(photos: DecodedPhotos, frame: FieldFrame) -> TrainingRays:
+    """The table of all training pixels. Photos of one camera share its bearings."""
+    posed = photos.posed
+    sizes = [camera.width * camera.height for camera in posed.cameras]
+    first_bearing = [0, *accumulate(sizes)]
+    in_cam = [bearings_from_image(camera, pixel_centers(camera.width, camera.height)) for camera in posed.cameras]
+    radii = [0.5 * rows[:, 2] / np.mean(camera.focal) for rows, camera in zip(in_cam, posed.cameras, strict=True)]
+    pixels, image_rows, bearing_rows = [], [], []
+    for v, k in enumerate(posed.camera_of_photo.tolist()):
+        bearing_rows.append(np.arange(first_bearing[k], first_bearing[k + 1], dtype=np.int32))
+        image_rows.append(np.full(sizes[k], v, dtype=np.int32))
+        rgba = np.full((sizes[k], 4), 255, dtype=np.uint8)
+        rgba[:, : photos.pixels[v].shape[2]] = photos.pixels[v].reshape(sizes[k], -1)
         pixels.append(rgba)
 
-    all_bearings = np.concatenate(bearings)
+    all_bearings = np.concatenate(in_cam)
     bearing = np.concatenate(bearing_rows)
-    kept = [np.ones(i.pixels.shape[:2], dtype=bool) if i.keep is None else i.keep for i in images]
+    kept = [
+        np.ones(p.shape[:2], dtype=bool) if k is None else k for p, k in zip(photos.pixels, photos.keep, strict=True)
+    ]
     reached = np.all(np.isfinite(all_bearings), axis=1)[bearing] & np.concatenate([k.reshape(-1) for k in kept])
     image_of = np.concatenate(image_rows)[reached]
-    poses = Rigid3.stack([image.cam_from_world for image in images])
-    normalized_from_world = frame.normalized_from_world
+    poses, normalized_from_world = posed.cam_from_world, frame.normalized_from_world
     return TrainingRays(
         pixels=np.concatenate(pixels)[reached],
         background=frame.background,
@@ -174,21 +142,46 @@ def training_rays(images: tuple[PosedImage, ...], frame: FieldFrame) -> Training
         bearings=np.nan_to_num(all_bearings).astype(np.float32),
         pixel_radius=np.nan_to_num(np.concatenate(radii)).astype(np.float32),
         normalized_from_cam=(normalized_from_world.R @ np.swapaxes(poses.R, 1, 2)).astype(np.float32),
-        centers=normalized_from_world.apply(poses.target_origin_in_source()).astype(np.float32),
-        first_pixel=np.searchsorted(image_of, np.arange(len(images) + 1)),
+        centers=normalized_from_world.apply(posed.centers()).astype(np.float32),
+        first_pixel=np.searchsorted(image_of, np.arange(len(photos) + 1)),
     )
 
 
-def reduce_image(image: PosedImage, max_size: int) -> PosedImage:
-    """The same view with its longer side at most `max_size` pixels: each new pixel is the mean of the area it covers.
+def reduce_photos(photos: DecodedPhotos, max_size: int) -> DecodedPhotos:
+    """The same views with their longer sides at most `max_size` pixels, see `reduce_pixels`."""
+    posed = photos.posed
+    cameras = []
+    for camera in posed.cameras:
+        width, height = reduced_size(camera.width, camera.height, max_size)
+        cameras.append(camera if width == camera.width else rescale(camera, width, height))
+    pixels, keep = [], []
+    for v in range(len(photos)):
+        camera = cameras[int(posed.camera_of_photo[v])]
+        small, small_keep = reduce_pixels(photos.pixels[v], photos.keep[v], camera.width, camera.height)
+        pixels.append(small)
+        keep.append(small_keep)
+    return DecodedPhotos(replace(posed, cameras=tuple(cameras)), tuple(pixels), tuple(keep))
 
-    Colours are weighted by alpha, so that what lies under transparent pixels does not bleed in.
+
+def reduced_size(width: int, height: int, max_size: int) -> tuple[int, int]:
+    """Width and height with the longer one at most `max_size`."""
+    longer = max(width, height)
+    if longer <= max_size:
+        return width, height
+    return max(1, round(width * max_size / longer)), max(1, round(height * max_size / longer))
+
+
+def reduce_pixels(
+    pixels: UInt8[np.ndarray, "h w c"], keep: Bool[np.ndarray, "h w"] | None, new_width: int, new_height: int
+) -> tuple[UInt8[np.ndarray, "new_h new_w c"], Bool[np.ndarray, "new_h new_w"] | None]:
+    """A photo and its mask at a smaller size: each new pixel is the mean of the area it covers.
+
+    Colours are weighted by alpha, so that what lies under transparent pixels does not bleed in. A new pixel is kept if
+    all that it covers is.
     """
-    height, width = image.pixels.shape[:2]
-    if max(height, width) <= max_size:
-        return image
-    new_width = max(1, round(width * max_size / max(height, width)))
-    new_height = max(1, round(height * max_size / max(height, width)))
+    height, width = pixels.shape[:2]
+    if (width, height) == (new_width, new_height):
+        return pixels, keep
     # Nearly all weights are 0: sparse, this is ten times as fast.
     rows, columns = csr_array(area_weights(height, new_height)), csr_array(area_weights(width, new_width))
 
@@ -198,17 +191,15 @@ def reduce_image(image: PosedImage, max_size: int) -> PosedImage:
         across = np.ascontiguousarray(lines.transpose(1, 0, 2)).reshape(width, -1)
         return (columns @ across).reshape(new_width, new_height, channels).transpose(1, 0, 2)
 
-    rgb = image.pixels[..., :3].astype(np.float64)
-    if image.pixels.shape[2] == 3:
-        pixels = mean(rgb)
+    rgb = pixels[..., :3].astype(np.float64)
+    if pixels.shape[2] == 3:
+        small = mean(rgb)
     else:
-        alpha = image.pixels[..., 3:].astype(np.float64)
+        alpha = pixels[..., 3:].astype(np.float64)
         mean_alpha = mean(alpha)
-        pixels = np.concatenate([mean(rgb * alpha) / np.maximum(mean_alpha, 1e-9), mean_alpha], axis=2)
-    pixels = np.rint(np.clip(pixels, 0.0, 255.0)).astype(np.uint8)
-    # A new pixel is kept if all that it covers is.
-    keep = None if image.keep is None else mean(image.keep[..., None].astype(np.float64))[..., 0] > 1.0 - 1e-6
-    return PosedImage(image.name, rescale(image.camera, new_width, new_height), image.cam_from_world, pixels, keep)
+        small = np.concatenate([mean(rgb * alpha) / np.maximum(mean_alpha, 1e-9), mean_alpha], axis=2)
+    small_keep = None if keep is None else mean(keep[..., None].astype(np.float64))[..., 0] > 1.0 - 1e-6
+    return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8), small_keep
 
 
 def area_weights(size: int, new_size: int) -> Float[np.ndarray, "new_size size"]:
@@ -217,17 +208,6 @@ def area_weights(size: int, new_size: int) -> Float[np.ndarray, "new_size size"]
     old = np.arange(size)
     overlap = np.minimum(edges[1:, None], old + 1.0) - np.maximum(edges[:-1, None], old)
     return np.maximum(overlap, 0.0) * (new_size / size)
-
-
-def reduce_images(images: tuple[PosedImage, ...], max_size: int) -> tuple[PosedImage, ...]:
-    """`reduce_image` of each; images that shared a camera still share one."""
-    reduced_cameras: dict[int, Camera] = {}
-    out = []
-    for image in images:
-        small = reduce_image(image, max_size)
-        camera = reduced_cameras.setdefault(id(image.camera), small.camera)
-        out.append(replace(small, camera=camera))
-    return tuple(out)
 
 
 def split_every(names: list[str], every: int = TEST_EVERY) -> tuple[list[int], list[int]]:
@@ -241,14 +221,14 @@ def split_every(names: list[str], every: int = TEST_EVERY) -> tuple[list[int], l
 
 
 def poses_in_frame(
-    images: Sequence[PosedImage], frame: FieldFrame
+    cam_from_world: Rigid3, frame: FieldFrame
 ) -> tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 3"]]:
-    """Frame axes from camera axes, and centres, of every photo; float32."""
+    """Frame axes from camera axes, and centres, of a batch of poses; float32."""
     world = frame.normalized_from_world
-    poses = [image.cam_from_world for image in images]
-    rotations = np.stack([world.R @ pose.R.T for pose in poses]).astype(np.float32)
-    centers = np.stack([world.apply(pose.target_origin_in_source()) for pose in poses])
-    return rotations, centers.astype(np.float32)
+    rotations = world.R @ np.swapaxes(cam_from_world.R, -1, -2)
+    # One by one: a matrix product of all may round otherwise, and runs are told apart by their bytes.
+    centers = [world.apply(center) for center in cam_from_world.target_origin_in_source()]
+    return rotations.astype(np.float32), np.stack(centers).astype(np.float32)
 
 
 def blender_frame(near: float = BLENDER_NEAR, far: float = BLENDER_FAR) -> FieldFrame:
@@ -308,12 +288,12 @@ def frame_around(
     )
 
 
-def default_background(images: tuple[PosedImage, ...]) -> Float[np.ndarray, "3"]:
+def default_background(photos: DecodedPhotos) -> Float[np.ndarray, "3"]:
     """White where the photos have an alpha channel, else the mean colour of the photos.
 
     Without alpha, whatever light passes the field must look like something; the mean colour is the guess with the
     least error, and a black one would tempt a young field to fade to black everywhere.
     """
-    if any(image.pixels.shape[2] == 4 for image in images):
+    if any(pixels.shape[2] == 4 for pixels in photos.pixels):
         return np.array(WHITE)
-    return np.mean([image.pixels.reshape(-1, 3).mean(axis=0) for image in images], axis=0) / 255.0
+    return np.mean([pixels.reshape(-1, 3).mean(axis=0) for pixels in photos.pixels], axis=0) / 255.0

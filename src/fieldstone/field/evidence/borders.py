@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_dilation, label
-
-from fieldstone.field.base.ray_dataset import PosedImage
 
 MAX_LEVEL = 8
 """A black that was saved as JPEG is not quite 0."""
@@ -23,18 +21,18 @@ BLEND_PX = 2
 """Pixels beside the border are mixtures."""
 
 
-def kept_inside_borders(images: Sequence[PosedImage]) -> Bool[np.ndarray, "h w"] | None:
+def kept_inside_borders(photos: Sequence[UInt8[np.ndarray, "h w _"]]) -> Bool[np.ndarray, "h w"] | None:
     """The pixels inside of the border that all photos of one camera share; None: there is no border.
 
     The border of an undistorted photo depends on the lens alone: it is where all photos are black, and it touches the
     edges.
 
     Args:
-        images: Of one size.
+        photos: Pixels of the photos of one camera.
     """
-    if len(images) < MIN_PHOTOS or any(image.pixels.shape[2] == 4 for image in images):
+    if len(photos) < MIN_PHOTOS or any(pixels.shape[2] == 4 for pixels in photos):
         return None
-    black = np.logical_and.reduce([image.pixels.max(axis=2) <= MAX_LEVEL for image in images])
+    black = np.logical_and.reduce([pixels.max(axis=2) <= MAX_LEVEL for pixels in photos])
     regions = np.zeros(black.shape, dtype=np.int32)
     label(black, output=regions)
     edges = np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]])

@@ -5,7 +5,7 @@ Without it, a field explains the photos best by a coloured cloud right in front 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
@@ -13,10 +13,12 @@ from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints
+from fieldstone.field.base.ray_dataset import SeenPoints
 from fieldstone.field.base.space import Space, normalized_from_grid
 from fieldstone.field.grid.occupancy import Occupancy
-from fieldstone.geometry.camera import image_from_cam
+from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.scene.photos import PosedPhotos
 from fieldstone.scene.rays import pixel_centers
 
 FREE_FRACTION = 0.7
@@ -49,9 +51,9 @@ MIN_SEEN = 20
 
 def carve_free_space(
     occupancy: Occupancy,
-    images: Sequence[PosedImage],
+    photos: PosedPhotos,
     frame: FieldFrame,
-    seen: Mapping[str, SeenPoints],
+    seen: Sequence[SeenPoints | None],
     space: Space,
     executor: Executor,
 ) -> Occupancy:
@@ -63,28 +65,29 @@ def carve_free_space(
     photo would ever correct what the coarse grids spread into them, and a new view may look through them.
 
     Args:
-        seen: By name of the photo, in the world.
+        seen: Of each photo, in the world.
     """
     corners = corners_in_world(occupancy, frame, space)
     positions, shape = corners.reshape(-1, 3), corners.shape[:3]
 
-    def of_photo(image: PosedImage) -> tuple[np.ndarray, ...]:
+    def of_photo(v: int) -> tuple[np.ndarray, ...]:
         """Cells that are free, that the photo sees, that it sees from near, that it sees a part of, and around it."""
-        away = np.linalg.norm(positions - image.cam_from_world.target_origin_in_source(), axis=1)
-        pixels = image_from_cam(image.camera, image.cam_from_world.apply(positions))
+        camera, pose, points = photos.camera_of(v), photos.pose_of(v), seen[v]
+        away = np.linalg.norm(positions - pose.target_origin_in_source(), axis=1)
+        pixels = image_from_cam(camera, pose.apply(positions))
         # nan, behind the camera, is not inside.
-        inside = np.all((pixels >= 0) & (pixels <= [image.camera.width, image.camera.height]), axis=1)
+        inside = np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=1)
         free, near, around = np.zeros((3, len(positions)), dtype=bool)
-        points = seen.get(image.name)
         if points is not None and len(points.xyz) >= MIN_SEEN:
-            distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
-            free[inside] = away[inside] < FREE_FRACTION * least_distance(image, points.xyz, distances, pixels[inside])
+            distances = np.linalg.norm(points.xyz - pose.target_origin_in_source(), axis=1)
+            least = least_distance(camera, pose, points.xyz, distances, pixels[inside])
+            free[inside] = away[inside] < FREE_FRACTION * least
             near = inside & (away < np.percentile(distances, NEAR_PERCENT))
             around = away < FREE_FRACTION * np.percentile(distances, AROUND_PERCENT)
         # A photo may see a part of a cell, but none of its corners.
         spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
         (left, right), (top, bottom) = spans
-        part = (right >= 0) & (left <= image.camera.width) & (bottom >= 0) & (top <= image.camera.height)
+        part = (right >= 0) & (left <= camera.width) & (bottom >= 0) & (top <= camera.height)
         some = [of_corners(flags, np.logical_or) for flags in (inside, near)]
         return of_corners(free, np.logical_and), *some, part, of_corners(around, np.logical_and)
 
@@ -94,36 +97,39 @@ def carve_free_space(
     cells = occupancy.cells.copy()
     times_seen = np.zeros(cells.shape, dtype=np.int32)
     near_some, parts_seen, around_some = np.zeros((3, *cells.shape), dtype=bool)
-    for free, visible, near, part, around in executor.map(of_photo, images):
+    for free, visible, near, part, around in executor.map(of_photo, range(len(photos))):
         cells &= ~free
         times_seen += visible
         near_some |= near
         parts_seen |= part
         around_some |= around
-    cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(images) >= MANY_PHOTOS else 2)))
+    cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(photos) >= MANY_PHOTOS else 2)))
     cells &= ~around_some | parts_seen
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
 
 
-def free_distances(frame: FieldFrame, seen: Mapping[str, SeenPoints]) -> Callable[[PosedImage], Float[np.ndarray, "p"]]:
-    """How far every pixel of a photo probably sees, in the frame; 0 where too little is known.
+def free_distances(
+    photos: PosedPhotos, frame: FieldFrame, seen: Sequence[SeenPoints | None]
+) -> Callable[[int], Float[np.ndarray, "p"]]:
+    """How far every pixel of photo v probably sees, in the frame; 0 where too little is known.
 
     Unlike in `carve_free_space`, something may stand there: the distance is nearly that of the points around it.
     """
 
-    def of_photo(image: PosedImage) -> Float[np.ndarray, "p"]:
-        camera, points = image.camera, seen.get(image.name)
+    def of_photo(v: int) -> Float[np.ndarray, "p"]:
+        camera, pose, points = photos.camera_of(v), photos.pose_of(v), seen[v]
         if points is None or len(points.xyz) < MIN_SEEN:
             return np.zeros(camera.width * camera.height, dtype=np.float32)
-        distances = np.linalg.norm(points.xyz - image.cam_from_world.target_origin_in_source(), axis=1)
-        least = least_distance(image, points.xyz, distances, pixel_centers(camera.width, camera.height))
+        distances = np.linalg.norm(points.xyz - pose.target_origin_in_source(), axis=1)
+        least = least_distance(camera, pose, points.xyz, distances, pixel_centers(camera.width, camera.height))
         return (FREE_LOSS_FRACTION * frame.normalized_from_world.scale * least).astype(np.float32)
 
     return of_photo
 
 
 def least_distance(
-    image: PosedImage,
+    camera: Camera,
+    cam_from_world: Rigid3,
     points: Float[np.ndarray, "p 3"],
     distances: Float[np.ndarray, "p"],
     pixels: Float[np.ndarray, "n 2"],
@@ -133,10 +139,10 @@ def least_distance(
     Args:
         points: In the world; distances: from the camera.
     """
-    size = np.array([image.camera.width, image.camera.height])
+    size = np.array([camera.width, camera.height])
     block = size.max() / BLOCKS
     centers = np.stack(np.meshgrid(*(np.arange(np.ceil(n / block)) for n in size), indexing="ij"), axis=-1)
-    tree = KDTree(image_from_cam(image.camera, image.cam_from_world.apply(points)))
+    tree = KDTree(image_from_cam(camera, cam_from_world.apply(points)))
     _, nearest = tree.query((centers.reshape(-1, 2) + 0.5) * block, k=NEIGHBOURS)
     least = distances[nearest].min(axis=1).reshape(centers.shape[:2])
     i, j = np.minimum((pixels / block).astype(np.int64), np.array(least.shape) - 1).T

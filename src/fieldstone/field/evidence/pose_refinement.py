@@ -10,18 +10,19 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, surface_depth
-from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, reduce_images
+from fieldstone.field.base.ray_dataset import SeenPoints, reduce_photos
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.jacobian import image_from_world_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.scene.photos import DecodedPhotos
 from fieldstone.scene.rays import Rays, rays_from_view
 
 SIZE_PX = 112
@@ -46,38 +47,36 @@ LEAST_SIGMA = 0.004
 
 
 @dataclass(frozen=True, eq=False)
-class RefinablePhoto:
-    """A small photo at the pose that it was given."""
+class RefinablePoses:
+    """Small photos at the poses that they were given, and what holds them there."""
 
-    image: PosedImage
-    information: Float[np.ndarray, "6 6"]
-    """What the known points say of the pose: the inverse covariance of a tangent (omega, v), see `Rigid3.retract`."""
+    photos: DecodedPhotos
+    information: Float[np.ndarray, "v 6 6"]
+    """What the known points say of each pose: the inverse covariance of a tangent (omega, v), see `Rigid3.retract`."""
 
 
-def refinable_photos(
-    images: tuple[PosedImage, ...], frame: FieldFrame, seen: Mapping[str, SeenPoints] | None
-) -> tuple[RefinablePhoto, ...]:
+def refinable_poses(photos: DecodedPhotos, frame: FieldFrame, seen: Sequence[SeenPoints | None]) -> RefinablePoses:
     """The photos as they are compared, and what holds them.
 
     Args:
-        seen: Known points of each photo by name, in the world.
+        seen: Known points of each photo, in the world; empty: nothing is known of any.
     """
     corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
     middle = frame.normalized_from_world.inverse().apply(corners)
-    out = []
-    for image, small in zip(images, reduce_images(images, SIZE_PX), strict=True):
-        known = (seen or {}).get(image.name)
+    information = np.empty((len(photos), 6, 6))
+    for v in range(len(photos)):
+        known = seen[v] if seen else None
         points, sigma_px = middle, UNKNOWN_SIGMA_PX
         if known is not None and len(known.xyz) >= MIN_POINTS:
             points, sigma_px = known.xyz, SIGMA_PX
-        J = image_from_world_jacobian(image.camera, image.cam_from_world, points).by_pose
+        J = image_from_world_jacobian(photos.posed.camera_of(v), photos.posed.pose_of(v), points).by_pose
         J = J[np.isfinite(J).all(axis=(1, 2))]
-        out.append(RefinablePhoto(small, np.einsum("nki,nkj->ij", J, J) / sigma_px**2))
-    return tuple(out)
+        information[v] = np.einsum("nki,nkj->ij", J, J) / sigma_px**2
+    return RefinablePoses(reduce_photos(photos, SIZE_PX), information)
 
 
 def refined(
-    photos: Sequence[RefinablePhoto],
+    refinable: RefinablePoses,
     pose_deltas: Float[np.ndarray, "v 6"],
     render_rays: RayRenderer,
     gains: Float[np.ndarray, "v 3"],
@@ -95,16 +94,17 @@ def refined(
         The tangents after the step.
     """
     out = pose_deltas.copy()
-    for v, photo in enumerate(photos):
-        target = photo.image.composited(background).reshape(-1, 3)
-        here = _compare(photo, pose_deltas[v], render_rays, gains[v], target)
-        step = _step(photo, pose_deltas[v], here)
+    photos = refinable.photos
+    for v, information in enumerate(refinable.information):
+        target = photos.composited(v, background).reshape(-1, 3)
+        here = _compare(photos, v, pose_deltas[v], render_rays, gains[v], target)
+        step = _step(photos.posed.camera_of(v), information, pose_deltas[v], here)
         if step is None:
             continue
-        there = _compare(photo, pose_deltas[v] + step, render_rays, gains[v], target)
+        there = _compare(photos, v, pose_deltas[v] + step, render_rays, gains[v], target)
         both = here.usable & there.usable
-        sigma = here.sigma
-        if _cost(there, both, sigma, photo, pose_deltas[v] + step) < _cost(here, both, sigma, photo, pose_deltas[v]):
+        sigma, after = here.sigma, pose_deltas[v] + step
+        if _cost(there, both, sigma, information, after) < _cost(here, both, sigma, information, pose_deltas[v]):
             out[v] += step
     return out
 
@@ -118,12 +118,6 @@ def at_surfaces(render_rays: RayRenderer, far: float) -> RayRenderer:
         return RenderedRays(found.rgb, np.where(np.isfinite(depth), depth, far).astype(np.float32), found.opacity)
 
     return render
-
-
-def refined_images(images: Sequence[PosedImage], pose_deltas: Float[np.ndarray, "v 6"]) -> tuple[PosedImage, ...]:
-    """The photos at their refined poses."""
-    pairs = zip(images, pose_deltas, strict=True)
-    return tuple(replace(image, cam_from_world=image.cam_from_world.retract(tangent)) for image, tangent in pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,17 +139,17 @@ class _Comparison:
 
 
 def _compare(
-    photo: RefinablePhoto, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
+    photos: DecodedPhotos, v: int, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
 ) -> _Comparison:
-    image = photo.image
-    pose = image.cam_from_world.retract(tangent)
-    rays = rays_from_view(image.camera, pose)
+    camera, keep = photos.posed.camera_of(v), photos.keep[v]
+    pose = photos.posed.pose_of(v).retract(tangent)
+    rays = rays_from_view(camera, pose)
     reached = np.flatnonzero(np.isfinite(rays.directions).all(axis=1))
     rendered = _rendered(render_rays, rays, reached)
     shown = rendered.rgb.astype(np.float64) * gain
-    usable = _inside_surfaces(image.camera, rendered)
-    if image.keep is not None:
-        usable &= image.keep.reshape(-1)
+    usable = _inside_surfaces(camera, rendered)
+    if keep is not None:
+        usable &= keep.reshape(-1)
     points = rays.origins + rays.directions * rendered.depth[:, None]
     return _Comparison(pose, rendered, shown, target - shown, usable, points)
 
@@ -177,9 +171,8 @@ def _inside_surfaces(camera: Camera, rendered: RenderedRays) -> Bool[np.ndarray,
     return (farthest < MAX_DEPTH_RATIO * nearest).reshape(-1)
 
 
-def _step(photo: RefinablePhoto, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
+def _step(camera: Camera, information: np.ndarray, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
     """The minimum of the linearised squares; None where nothing can be compared."""
-    camera = photo.image.camera
     grid = here.shown.reshape(camera.height, camera.width, 3)
     if min(grid.shape[:2]) < 3 or not here.usable.any():
         return None
@@ -192,15 +185,15 @@ def _step(photo: RefinablePhoto, tangent: np.ndarray, here: _Comparison) -> np.n
     good = np.isfinite(G).all(axis=1)
     G, r = G[good], r[good]
     weight = 1.0 / (1.0 + (r / here.sigma) ** 2) / (SAME_ERROR * here.sigma**2)
-    A = (G * weight[:, None]).T @ G + photo.information
-    b = G.T @ (weight * r) + photo.information @ tangent
+    A = (G * weight[:, None]).T @ G + information
+    b = G.T @ (weight * r) + information @ tangent
     try:
         return -np.linalg.solve(A, b)
     except np.linalg.LinAlgError:
         return None
 
 
-def _cost(at: _Comparison, usable: np.ndarray, sigma: float, photo: RefinablePhoto, tangent: np.ndarray) -> float:
+def _cost(at: _Comparison, usable: np.ndarray, sigma: float, information: np.ndarray, tangent: np.ndarray) -> float:
     """Robust mean of the squared differences, as many as there are, and what the known points pay."""
     r = at.residual[usable] / sigma
-    return float(0.5 * np.log1p(r**2).sum() / SAME_ERROR + 0.5 * tangent @ photo.information @ tangent)
+    return float(0.5 * np.log1p(r**2).sum() / SAME_ERROR + 0.5 * tangent @ information @ tangent)

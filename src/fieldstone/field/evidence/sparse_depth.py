@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage, SeenPoints, poses_in_frame
+from fieldstone.field.base.ray_dataset import SeenPoints, poses_in_frame
 from fieldstone.field.base.space import Space, along_rays
 from fieldstone.field.grid.rays import RayTable, coprime_stride
 from fieldstone.field.grid.terms_numba import SparseDepths
 from fieldstone.geometry.camera import image_from_cam
+from fieldstone.scene.photos import DecodedPhotos
 from fieldstone.scene.reconstruction import Reconstruction
 
 MIN_SIGMA_PX = 0.5
@@ -22,8 +23,8 @@ MAX_SIGMA = 0.1
 """Points whose distance is uncertain by more than this share are left out."""
 
 
-def seen_points(model: Reconstruction) -> dict[str, SeenPoints]:
-    """The points that each photo of a model observes, with the standard deviations of their distances.
+def seen_points(model: Reconstruction, views: Sequence[int]) -> tuple[SeenPoints, ...]:
+    """The points that each of these views of a model observes, with the standard deviations of their distances.
 
     Every observation of a point along direction d (unit) at distance D, with a focal length of f pixels, says
     (f / (sigma D))^2 (I - d d^T) of it; sigma is the reprojection error of the point (RMS), at least `MIN_SIGMA_PX`.
@@ -53,10 +54,8 @@ def seen_points(model: Reconstruction) -> dict[str, SeenPoints]:
     covariance = np.linalg.inv(information)
     sigma = np.sqrt(np.einsum("oi,oij,oj->o", d, covariance[point], d))
     good = (count[point] >= 2) & (sigma < MAX_SIGMA * distance)
-    return {
-        model.views[v].name: SeenPoints(model.points.xyz[point[good & (view == v)]], sigma[good & (view == v)])
-        for v in registered.tolist()
-    }
+    rows_of = [good & (view == v) for v in views]
+    return tuple(SeenPoints(model.points.xyz[point[rows]], sigma[rows]) for rows in rows_of)
 
 
 def no_sparse_depth_rays() -> tuple[RayTable, SparseDepths]:
@@ -76,31 +75,31 @@ def no_sparse_depth_rays() -> tuple[RayTable, SparseDepths]:
 
 
 def sparse_depth_rays(
-    images: Sequence[PosedImage],
+    photos: DecodedPhotos,
     frame: FieldFrame,
-    seen: Mapping[str, SeenPoints],
+    seen: Sequence[SeenPoints | None],
     space: Space,
 ) -> tuple[RayTable, SparseDepths]:
     """Rays from photos to the points that they see, the colours there, and how far along each ray its point lies.
 
     Args:
-        seen: By name of the photo, in the world.
+        seen: Of each photo, in the world.
     """
-    rotations, centers = poses_in_frame(images, frame)
+    rotations, centers = poses_in_frame(photos.posed.cam_from_world, frame)
     world = frame.normalized_from_world
     parts = []
-    for v, image in enumerate(images):
-        points = seen.get(image.name)
+    for v, points in enumerate(seen):
         if points is None or not len(points.xyz):
             continue
-        in_cam = image.cam_from_world.apply(points.xyz)
-        pixels = image_from_cam(image.camera, in_cam)
-        inside = np.all((pixels >= 0.5) & (pixels <= [image.camera.width - 0.5, image.camera.height - 0.5]), axis=1)
+        camera, keep = photos.posed.camera_of(v), photos.keep[v]
+        in_cam = photos.posed.pose_of(v).apply(points.xyz)
+        pixels = image_from_cam(camera, in_cam)
+        inside = np.all((pixels >= 0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5]), axis=1)
         rows = np.flatnonzero(inside)
-        if image.keep is not None:
+        if keep is not None:
             column, row = pixels[rows].astype(np.int64).T
-            rows = rows[image.keep[row, column]]
-        rgba = _colors(image.pixels, pixels[rows])
+            rows = rows[keep[row, column]]
+        rgba = _colors(photos.pixels[v], pixels[rows])
         rows, rgba = rows[rgba[:, 3] > 127], rgba[rgba[:, 3] > 127]
         xyz, sigma = world.apply(points.xyz[rows]), world.scale * points.sigma[rows]
         along = np.stack(along_rays(space, centers[v], xyz, sigma))

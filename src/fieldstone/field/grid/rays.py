@@ -7,14 +7,15 @@ from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.ray_dataset import PosedImage, poses_in_frame
+from fieldstone.field.base.ray_dataset import poses_in_frame
 from fieldstone.field.grid.march_numba import Box
 from fieldstone.field.grid.occupancy_numba import rays_that_hit
 from fieldstone.geometry.camera import bearings_from_image
+from fieldstone.scene.photos import DecodedPhotos, PosedPhotos
 from fieldstone.scene.rays import pixel_centers
 
 GOLDEN_RATIO = 0.6180339887498949
@@ -41,45 +42,43 @@ class RayTable(NamedTuple):
 
 
 def ray_table(
-    images: tuple[PosedImage, ...],
+    photos: DecodedPhotos,
     frame: FieldFrame,
     box: Box,
     executor: Executor,
     *,
     use_alpha: bool = True,
-    free_distance_of: Callable[[PosedImage], Float[np.ndarray, "p"]] | None = None,
+    free_distance_of: Callable[[int], Float[np.ndarray, "p"]] | None = None,
 ) -> RayTable:
     """The table of all pixels whose rays meet an occupied cell, and some beside them (all, in an open space).
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
-        free_of: How far every pixel of a photo probably sees, see `RayTable.free_distance`.
+        free_of: How far every pixel of photo v probably sees, see `RayTable.free_distance`.
 
     Raises:
         InputError: No ray meets the box.
     """
-    first_bearing, bearings = _bearings(images)
-    rotations, centers = poses_in_frame(images, frame)
+    posed = photos.posed
+    first_bearing, bearings = _bearings(posed)
+    rotations, centers = poses_in_frame(posed.cam_from_world, frame)
 
     def rows_of(v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera = images[v].camera
-        first = first_bearing[id(camera)]
+        camera, keep = posed.camera_of(v), photos.keep[v]
+        first = first_bearing[posed.camera_of_photo[v]]
         in_cam = bearings[first : first + camera.width * camera.height]
         reached = np.isfinite(in_cam[:, 0])
-        keep = images[v].keep
         if keep is not None:
             reached &= keep.reshape(-1)
         if not box.space.is_open:
             by_row = in_cam.reshape(camera.height, camera.width, 3)
             reached &= pixels_that_hit(box, centers[v], rotations[v], by_row, float(np.mean(camera.focal))).reshape(-1)
         rows = np.flatnonzero(reached)
-        whole_pixels = _rgba(images[v], frame, use_alpha).view(np.uint32)  # one number each is faster to take
-        free_distance = (
-            np.zeros(len(rows), dtype=np.float32) if free_distance_of is None else free_distance_of(images[v])[rows]
-        )
+        whole_pixels = _rgba(photos, v, frame, use_alpha).view(np.uint32)  # one number each is faster to take
+        free_distance = np.zeros(len(rows), np.float32) if free_distance_of is None else free_distance_of(v)[rows]
         return (rows + first).astype(np.int32), whole_pixels[rows].view(np.uint8), free_distance
 
-    parts = list(executor.map(rows_of, range(len(images))))
+    parts = list(executor.map(rows_of, range(len(photos))))
     counts = [len(rows) for rows, _, _ in parts]
     total = sum(counts)
     if total == 0:
@@ -88,7 +87,7 @@ def ray_table(
             "and, if there are masks, that the scene is white in them"
         )
     return RayTable(
-        image=np.repeat(np.arange(len(images), dtype=np.int32), counts),
+        image=np.repeat(np.arange(len(photos), dtype=np.int32), counts),
         bearing=np.concatenate([rows for rows, _, _ in parts]),
         rgba=np.concatenate([rgba for _, rgba, _ in parts]),
         bearings=bearings,
@@ -138,25 +137,22 @@ def coprime_stride(count: int) -> int:
     return stride
 
 
-def _bearings(images: tuple[PosedImage, ...]) -> tuple[dict[int, int], Float[np.ndarray, "k 3"]]:
-    """Bearings of every pixel of every camera, and where each camera's start."""
-    first: dict[int, int] = {}
-    parts: list[np.ndarray] = []
-    count = 0
-    for image in images:
-        camera = image.camera
-        if id(camera) not in first:
-            first[id(camera)] = count
-            parts.append(bearings_from_image(camera, pixel_centers(camera.width, camera.height)).astype(np.float32))
-            count += len(parts[-1])
-    return first, np.concatenate(parts)
+def _bearings(posed: PosedPhotos) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "k 3"]]:
+    """Where each camera's bearings start, and the bearings of every pixel of every camera."""
+    parts = [
+        bearings_from_image(camera, pixel_centers(camera.width, camera.height)).astype(np.float32)
+        for camera in posed.cameras
+    ]
+    return np.cumsum([0, *map(len, parts[:-1])], dtype=np.int32), np.concatenate(parts)
 
 
-def _rgba(image: PosedImage, frame: FieldFrame, use_alpha: bool) -> np.ndarray:
-    """(h w, 4) uint8."""
-    rgba = np.full((image.camera.width * image.camera.height, 4), 255, dtype=np.uint8)
-    if use_alpha or image.pixels.shape[2] == 3:
-        rgba[:, : image.pixels.shape[2]] = image.pixels.reshape(len(rgba), -1)
+def _rgba(photos: DecodedPhotos, v: int, frame: FieldFrame, use_alpha: bool) -> UInt8[np.ndarray, "p 4"]:
+    pixels = photos.pixels[v]
+    height, width, channels = pixels.shape
+    rgba = np.full((height * width, 4), 255, dtype=np.uint8)
+    if use_alpha or channels == 3:
+        rgba[:, :channels] = pixels.reshape(len(rgba), -1)
     else:
-        rgba[:, :3] = np.rint(255.0 * image.composited(frame.background)).astype(np.uint8).reshape(-1, 3)
+        composited = photos.composited(v, frame.background)
+        rgba[:, :3] = np.rint(255.0 * composited).astype(np.uint8).reshape(-1, 3)
     return rgba

@@ -21,7 +21,7 @@ from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, StepReport, in_world
 from fieldstone.field.base.ray_dataset import poses_in_frame
 from fieldstone.field.base.space import Space
-from fieldstone.field.evidence.pose_refinement import RefinablePhoto, at_surfaces, refined, refined_images
+from fieldstone.field.evidence.pose_refinement import RefinablePoses, at_surfaces, refined
 from fieldstone.field.grid.decoder import HIDDEN, Decoder, decoder_width, initial_decoder
 from fieldstone.field.grid.exposure import gains_of, step_exposure, unit_exposure
 from fieldstone.field.grid.field import FOREVER, REFERENCE_CELLS, GridField, clear_unreachable
@@ -93,8 +93,8 @@ class GridTraining:
     """All triangulated points."""
     alpha_known: bool
     """Photos say themselves where they show the background."""
-    refinable: tuple[RefinablePhoto, ...] = ()
-    """The photos whose poses may be refined; none, if they may not."""
+    refinable: RefinablePoses | None = None
+    """The photos whose poses may be refined; None, if they may not."""
 
     @property
     def num_images(self) -> int:
@@ -142,8 +142,8 @@ class GridTraining:
             state = self._pruned(state)
         if self._ends_warm_up(state):
             return self._begun_again(state)
-        if self._refines_poses(state):
-            state = self._with_refined_poses(state)
+        if self.refinable is not None and self._refines_poses(state):
+            state = self._with_refined_poses(state, self.refinable)
         levels = self._levels_now(state)
         return state if levels == state.field.layout.resolutions else grown(state, levels, self.num_images)
 
@@ -269,13 +269,13 @@ class GridTraining:
             field = without_floating_cells(field, self.points_in_grid, self.executor)
         return replace(state, field=field, buffers=replace(state.buffers, box=field.box()))
 
-    def _with_refined_poses(self, state: GridState) -> GridState:
+    def _with_refined_poses(self, state: GridState, refinable: RefinablePoses) -> GridState:
         gains = gains_of(state.exposure).astype(np.float64).reshape(-1, 3)
         scale = self.frame.normalized_from_world.scale
         render_rays = at_surfaces(in_world(self.renderer(state), self.frame), self.frame.far / scale)
         deltas = state.pose_deltas
         for _ in range(POSE_STEPS):
-            deltas = refined(self.refinable, deltas, render_rays, gains, self.frame.background)
+            deltas = refined(refinable, deltas, render_rays, gains, self.frame.background)
         rotated_deg = np.rad2deg(np.linalg.norm(deltas[:, :3], axis=1))
         logger.info("poses refined: rotated by %.4f deg in the median", np.median(rotated_deg))
         rays, depth_rays = self._rays_from(deltas)
@@ -283,10 +283,10 @@ class GridTraining:
 
     def _rays_from(self, pose_deltas: Float[np.ndarray, "v 6"]) -> tuple[RayTable, RayTable]:
         """All rays and those to points, with the photos at refined poses; which pixels there are stays."""
-        if not self.refinable or not pose_deltas.any():
+        if self.refinable is None or not pose_deltas.any():
             return self.rays, self.depth_rays
-        images = refined_images([photo.image for photo in self.refinable], pose_deltas)
-        rotations, centers = poses_in_frame(images, self.frame)
+        refined_poses = self.refinable.photos.posed.cam_from_world.retract(pose_deltas)
+        rotations, centers = poses_in_frame(refined_poses, self.frame)
         rays, depth_rays = (t._replace(rotations=rotations, centers=centers) for t in (self.rays, self.depth_rays))
         return rays, depth_rays
 

@@ -10,20 +10,21 @@ import json
 import logging
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.io.files.names import name_problem
-from fieldstone.io.images.photos import PHOTO_SUFFIXES, Photo, PhotoProblem, read_photo, read_photo_info
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoProblem, read_photo_info
+from fieldstone.io.posed.posed_scene import PosedScene
+from fieldstone.scene.photos import posed_photos
 
 logger = logging.getLogger(__name__)
 
@@ -35,8 +36,7 @@ NEAR, FAR = 2.0, 6.0
 """Range of the rays of these scenes, in scene units: objects within 1.5 of the origin, cameras 4 away."""
 
 
-@dataclass(frozen=True, eq=False)
-class BlenderFrame:
+class _Frame(NamedTuple):
     """One image of a split: its name (the file's, without folder and suffix), file and pose."""
 
     name: str
@@ -45,24 +45,12 @@ class BlenderFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class BlenderScene:
-    """A scene as its files describe it; frames in the order of the files, those without an image left out."""
-
-    camera: Camera
-    splits: Mapping[str, tuple[BlenderFrame, ...]]
-    problems: tuple[PhotoProblem, ...]
-    """Images that a JSON file names and that are missing or no images."""
-    near: float = NEAR
-    far: float = FAR
-
-
-@dataclass(frozen=True, eq=False)
 class _Split:
     """What one JSON file says, before any image is looked for."""
 
     path: Path
     angle_x: float
-    frames: tuple[BlenderFrame, ...]
+    frames: tuple[_Frame, ...]
 
 
 def is_blender_folder(folder: Path) -> bool:
@@ -70,8 +58,8 @@ def is_blender_folder(folder: Path) -> bool:
     return (folder / "transforms_train.json").is_file()
 
 
-def read_blender(folder: Path) -> BlenderScene:
-    """Read poses and find images; `read_split` decodes them.
+def read_blender(folder: Path) -> PosedScene:
+    """Read poses and find images; photos in the order of the files, train before val before test.
 
     An image that is missing is reported and left out. A missing `transforms_val.json` or `transforms_test.json` is a
     scene without that split.
@@ -83,24 +71,15 @@ def read_blender(folder: Path) -> BlenderScene:
     if not is_blender_folder(folder):
         raise InputError(f"{folder / 'transforms_train.json'}: no such file; give a folder in the Blender format")
     described = {s: _read_json(p, folder) for s in SPLITS if (p := folder / f"transforms_{s}.json").is_file()}
-    splits: dict[str, tuple[BlenderFrame, ...]] = {}
-    sizes: dict[tuple[int, int], BlenderFrame] = {}
+    frames: list[_Frame] = []
+    splits: dict[str, Int[np.ndarray, "_"]] = {}
+    sizes: dict[tuple[int, int], _Frame] = {}
     problems: list[PhotoProblem] = []
     for name, split in described.items():
-        found = []
-        for frame in split.frames:
-            try:
-                info = read_photo_info(frame.path)
-            except InputError as error:
-                problems.append(PhotoProblem(frame.path, str(error)))
-                continue
-            sizes.setdefault((info.width, info.height), frame)
-            found.append(frame)
-        splits[name] = tuple(found)
-        if len(found) < len(split.frames):
-            missing = len(split.frames) - len(found)
-            logger.warning("%s: %d of %d images are missing or unreadable", split.path, missing, len(split.frames))
-    if not splits["train"]:
+        found = _frames_with_images(split, sizes, problems)
+        splits[name] = np.arange(len(frames), len(frames) + len(found))
+        frames += found
+    if not len(splits["train"]):
         given = len(described["train"].frames)
         raise InputError(
             f"{described['train'].path}: none of its {given} images is there"
@@ -112,32 +91,33 @@ def read_blender(folder: Path) -> BlenderScene:
         raise InputError(
             f"{second.path}: {b[0]} x {b[1]} pixels, but {first.path.name} has {a[0]} x {a[1]}; use images of one size"
         )
-    return BlenderScene(_camera(described, *next(iter(sizes))), splits, tuple(problems))
+    photos = posed_photos(
+        [frame.name for frame in frames],
+        [_camera(described, *next(iter(sizes)))],
+        np.zeros(len(frames), dtype=np.int64),
+        Rigid3.stack([frame.cam_from_world for frame in frames]),
+        paths=[frame.path for frame in frames],
+    )
+    return PosedScene(photos, splits, depth_range=(NEAR, FAR), problems=tuple(problems))
 
 
-def read_split(scene: BlenderScene, split: str) -> tuple[list[tuple[BlenderFrame, Photo]], list[PhotoProblem]]:
-    """Decode the images of a split; those that are damaged are reported and left out.
-
-    Raises:
-        InputError: The scene has no such split, or none of its images can be read.
-    """
-    frames = scene.splits.get(split, ())
-    if not frames:
-        raise InputError(f"the scene has no {split} images; it has {', '.join(s for s in scene.splits)}")
-    read: list[tuple[BlenderFrame, Photo]] = []
-    problems: list[PhotoProblem] = []
-    with ThreadPoolExecutor() as pool:
-        # Decoding leaves Python's lock; results are taken in the order of the frames.
-        reading = [pool.submit(read_photo, frame.path) for frame in frames]
-        for frame, photo in zip(frames, reading, strict=True):
-            try:
-                read.append((frame, photo.result()))
-            except InputError as error:
-                logger.warning("skipped %s", error)
-                problems.append(PhotoProblem(frame.path, str(error)))
-    if not read:
-        raise InputError(f"none of {len(frames)} {split} images can be read; the first: {problems[0].reason}")
-    return read, problems
+def _frames_with_images(
+    split: _Split, sizes: dict[tuple[int, int], _Frame], problems: list[PhotoProblem]
+) -> list[_Frame]:
+    """The frames whose images can be opened; `sizes` gets the first frame of each size, `problems` the others."""
+    found = []
+    for frame in split.frames:
+        try:
+            info = read_photo_info(frame.path)
+        except InputError as error:
+            problems.append(PhotoProblem(frame.path, str(error)))
+            continue
+        sizes.setdefault((info.width, info.height), frame)
+        found.append(frame)
+    if len(found) < len(split.frames):
+        missing = len(split.frames) - len(found)
+        logger.warning("%s: %d of %d images are missing or unreadable", split.path, missing, len(split.frames))
+    return found
 
 
 def _camera(described: Mapping[str, _Split], width: int, height: int) -> Camera:
@@ -177,7 +157,7 @@ def _read_json(path: Path, folder: Path) -> _Split:
     return _Split(path, float(angle), frames)
 
 
-def _frame(path: Path, folder: Path, index: int, entry: Any) -> BlenderFrame:
+def _frame(path: Path, folder: Path, index: int, entry: Any) -> _Frame:
     file_path = entry.get("file_path") if isinstance(entry, dict) else None
     if not isinstance(file_path, str):
         raise InputError(f"{path}, frame {index}: no file_path")
@@ -187,7 +167,7 @@ def _frame(path: Path, folder: Path, index: int, entry: Any) -> BlenderFrame:
     image = folder / relative
     if image.suffix.lower() not in PHOTO_SUFFIXES:
         image = image.with_name(image.name + ".png")
-    return BlenderFrame(image.stem, image, _pose(f"{path}, frame {index} ({relative})", entry.get("transform_matrix")))
+    return _Frame(image.stem, image, _pose(f"{path}, frame {index} ({relative})", entry.get("transform_matrix")))
 
 
 def _pose(where: str, value: Any) -> Rigid3:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.posed.posed_photos import rigid_from_gl
+from fieldstone.io.posed.posed_scene import rigid_from_gl
 
 LISTS = {"frames": "transform_matrix", "camera_path": "camera_to_world"}
 """Where the poses stand, and the name of the matrix of each."""

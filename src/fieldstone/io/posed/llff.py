@@ -15,7 +15,8 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.io.images.photos import PHOTO_SUFFIXES, read_photo_info
-from fieldstone.io.posed.posed_photos import MAX_DEVIATION, PosedPhoto, PosedScene
+from fieldstone.io.posed.posed_scene import MAX_DEVIATION, PosedScene
+from fieldstone.scene.photos import posed_photos, shared_cameras
 
 FILE = "poses_bounds.npy"
 
@@ -42,13 +43,12 @@ def read_llff(folder: Path, photos: Path | None = None) -> PosedScene:
     path = folder / FILE
     rows = _read_rows(path)
     images = _images(photos or _photo_folder(folder), len(rows))
-    found, points = [], []
-    cameras: dict[tuple[float, ...], Camera] = {}
+    cameras, poses, points = [], [], []
     for row, image in zip(rows, images, strict=True):
         matrix = row[:15].reshape(3, 5)
         height, width, focal = matrix[:, 4]
         near, far = row[15:]
-        where = f"{path}, row {len(found)} ({image.name})"
+        where = f"{path}, row {len(poses)} ({image.name})"
         R = matrix[:, :3] @ OPENCV_FROM_LLFF_AXES
         if np.abs(R.T @ R - np.eye(3)).max() > MAX_DEVIATION or np.linalg.det(R) < 0:
             raise InputError(f"{where}: its first 3x3 numbers are no rotation")
@@ -61,14 +61,15 @@ def read_llff(folder: Path, photos: Path | None = None) -> PosedScene:
                 f"{where}: the photo is {info.width}x{info.height}, the pose was made for {width:g}x{height:g}"
             )
         params = (focal * sx, focal * sy, 0.5 * info.width, 0.5 * info.height)
-        key = (info.width, info.height, *params)
-        camera = cameras.setdefault(key, Camera("PINHOLE", info.width, info.height, np.array(params)))
+        cameras.append(Camera("PINHOLE", info.width, info.height, np.array(params)))
         world_from_cam = Rigid3(nearest_rotation(R), matrix[:, 3])
-        found.append(PosedPhoto(image.name, image, camera, world_from_cam.inverse()))
+        poses.append(world_from_cam.inverse())
         fx, fy, cx, cy = params
         at_one = np.array([[(u * info.width - cx) / fx, (v * info.height - cy) / fy, 1.0] for u, v in CORNERS])
         points += [world_from_cam.apply(depth * at_one) for depth in (near, far)]
-    return PosedScene(tuple(found), None, np.concatenate(points))
+    names = [image.name for image in images]
+    table = posed_photos(names, *shared_cameras(cameras), Rigid3.stack(poses), paths=images)
+    return PosedScene(table, points_in_world=np.concatenate(points))
 
 
 def _read_rows(path: Path) -> np.ndarray:

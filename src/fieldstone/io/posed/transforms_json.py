@@ -12,17 +12,19 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.names import name_problem
-from fieldstone.io.images.photos import PHOTO_SUFFIXES, natural_key, read_photo_info
-from fieldstone.io.posed.posed_photos import PosedPhoto, PosedScene, rigid_from_gl
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoProblem, natural_key, read_photo_info
+from fieldstone.io.posed.posed_scene import PosedScene, rigid_from_gl
 from fieldstone.io.shapes.ply import read_points
+from fieldstone.scene.photos import posed_photos, shared_cameras
 
 logger = logging.getLogger(__name__)
 
@@ -51,9 +53,39 @@ def read_transforms(path: Path) -> PosedScene:
             no image is there.
     """
     top = _read_json(path)
-    photos: list[PosedPhoto] = []
-    named: dict[str, str] = {}
-    cameras: dict[tuple[Any, ...], Camera] = {}
+    frames, missing = _frames(path, top)
+    if missing:
+        logger.warning("%s: %d of %d images are missing: %s", path, len(missing), len(top["frames"]), missing[0])
+    if not frames:
+        first = f" (the first: {missing[0]})" if missing else ""
+        raise InputError(f"{path}: none of its {len(top['frames'])} images is there{first}; copy them beside it")
+    frames.sort(key=lambda frame: natural_key(frame.name))
+    photos = posed_photos(
+        [frame.name for frame in frames],
+        *shared_cameras([frame.camera for frame in frames]),
+        Rigid3.stack([frame.cam_from_world for frame in frames]),
+        paths=[frame.image for frame in frames],
+        masks=[frame.mask for frame in frames],
+    )
+    problems = tuple(PhotoProblem(path.parent / name, "no such file") for name in missing)
+    splits = _splits(path, top, [frame.file_path for frame in frames])
+    return PosedScene(photos, splits, _points(path, top), _box(path, top), problems=problems)
+
+
+class _Frame(NamedTuple):
+    """One entry of `frames` whose image is there."""
+
+    name: str
+    file_path: str
+    image: Path
+    mask: Path | None
+    camera: Camera
+    cam_from_world: Rigid3
+
+
+def _frames(path: Path, top: Mapping[str, Any]) -> tuple[list[_Frame], list[str]]:
+    """The frames whose images are there, and the `file_path` of those whose images are not."""
+    frames: dict[str, _Frame] = {}
     missing: list[str] = []
     for k, entry in enumerate(top["frames"]):
         where = f"{path}, frame {k}"
@@ -66,31 +98,29 @@ def read_transforms(path: Path) -> PosedScene:
             missing.append(file_path)
             continue
         name = image.relative_to(path.parent).as_posix()
-        if name in named:
+        if name in frames:
             raise InputError(f"{where}: the image {name} was named before; remove one of the two frames")
-        named[name] = file_path
-        camera = _camera(where, {**top, **entry}, image, cameras)
-        try:
-            matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)
-            pose = rigid_from_gl(matrix)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{where}: transform_matrix is no camera pose: {error}") from error
-        photos.append(PosedPhoto(name, image, camera, pose, _mask_path(where, path.parent, entry)))
-    if missing:
-        logger.warning("%s: %d of %d images are missing: %s", path, len(missing), len(top["frames"]), missing[0])
-    if not photos:
-        first = f" (the first: {missing[0]})" if missing else ""
-        raise InputError(f"{path}: none of its {len(top['frames'])} images is there{first}; copy them beside it")
-    photos.sort(key=lambda photo: natural_key(photo.name))
-    train, test = _split(path, top, photos, named)
-    points = np.empty((0, 3))
-    if top.get("ply_file_path"):
-        ply = path.parent / str(top["ply_file_path"])
-        if name_problem(str(top["ply_file_path"])) is None and ply.is_file():
-            points = read_points(ply).xyz
-        else:
-            logger.warning("%s: its points %s are missing", path, top["ply_file_path"])
-    return PosedScene(train, test, points, _box(path, top))
+        camera, mask = _camera(where, {**top, **entry}, image), _mask_path(where, path.parent, entry)
+        frames[name] = _Frame(name, file_path, image, mask, camera, _pose(where, entry))
+    return list(frames.values()), missing
+
+
+def _pose(where: str, entry: Mapping[str, Any]) -> Rigid3:
+    try:
+        return rigid_from_gl(np.array(entry.get("transform_matrix"), dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: transform_matrix is no camera pose: {error}") from error
+
+
+def _points(path: Path, top: Mapping[str, Any]) -> Float[np.ndarray, "p 3"]:
+    """The points that `ply_file_path` names."""
+    if not top.get("ply_file_path"):
+        return np.empty((0, 3))
+    ply = path.parent / str(top["ply_file_path"])
+    if name_problem(str(top["ply_file_path"])) is None and ply.is_file():
+        return read_points(ply).xyz
+    logger.warning("%s: its points %s are missing", path, top["ply_file_path"])
+    return np.empty((0, 3))
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -133,8 +163,8 @@ def _mask_path(where: str, folder: Path, entry: Mapping[str, Any]) -> Path | Non
     return folder / value.removeprefix("./")
 
 
-def _camera(where: str, given: Mapping[str, Any], image: Path, known: dict[tuple[Any, ...], Camera]) -> Camera:
-    """The camera of a frame; equal ones are one object."""
+def _camera(where: str, given: Mapping[str, Any], image: Path) -> Camera:
+    """The camera of a frame."""
     info = read_photo_info(image)
     width = _number(where, given, "w", float(info.width))
     height = _number(where, given, "h", float(info.height))
@@ -150,8 +180,7 @@ def _camera(where: str, given: Mapping[str, Any], image: Path, known: dict[tuple
     if abs(sx / sy - 1.0) > 0.02:
         raise InputError(f"{where}: the image is {info.width}x{info.height}, but w and h say {width:g}x{height:g}")
     params = (fx * sx, fy * sy, cx * sx, cy * sy, *coefficients)
-    key = (model, info.width, info.height, params)
-    return known.setdefault(key, Camera(model, info.width, info.height, np.array(params)))
+    return Camera(model, info.width, info.height, np.array(params))
 
 
 def _focal(where: str, given: Mapping[str, Any], name: str, radians: str, degrees: str, size: float) -> float | None:
@@ -201,22 +230,17 @@ def _number(where: str, given: Mapping[str, Any], name: str, default: float | No
     return float(value)
 
 
-def _split(
-    path: Path, top: Mapping[str, Any], photos: list[PosedPhoto], named: Mapping[str, str]
-) -> tuple[tuple[PosedPhoto, ...], tuple[PosedPhoto, ...] | None]:
+def _splits(path: Path, top: Mapping[str, Any], file_paths: Sequence[str]) -> dict[str, Int[np.ndarray, "_"]]:
     """By `train_filenames`, `test_filenames` and `val_filenames`, if the file has them."""
     lists = {key: top.get(f"{key}_filenames") for key in ("train", "test", "val")}
     if not any(lists.values()):
-        return tuple(photos), None
+        return {}
     held_out = set(lists["test"] or lists["val"] or ())
     train = set(lists["train"] or ())
-    tested = tuple(photo for photo in photos if named[photo.name] in held_out)
-    trained = tuple(
-        photo for photo in photos if (named[photo.name] in train if train else named[photo.name] not in held_out)
-    )
-    if not trained:
+    trained = [name in train if train else name not in held_out for name in file_paths]
+    if not any(trained):
         raise InputError(f"{path}: train_filenames names none of the images that are there")
-    return trained, tested
+    return {"train": np.flatnonzero(trained), "test": np.flatnonzero([name in held_out for name in file_paths])}
 
 
 def _box(path: Path, top: Mapping[str, Any]) -> Float[np.ndarray, "2 3"] | None:

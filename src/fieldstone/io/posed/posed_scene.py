@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
+from fieldstone.io.images.photos import PhotoProblem
+from fieldstone.scene.photos import PosedPhotos
+from fieldstone.scene.reconstruction import Reconstruction
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 
@@ -19,28 +21,32 @@ MAX_DEVIATION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class PosedPhoto:
-    """One photo; photos of one camera share the `Camera` object."""
-
-    name: str
-    path: Path
-    camera: Camera
-    cam_from_world: Rigid3
-    mask: Path | None = None
-    """Image of the photo's size, black where the photo is to be ignored."""
-
-
-@dataclass(frozen=True, eq=False)
 class PosedScene:
-    """What a scene file describes."""
+    """What scene files describe: photos that are not yet decoded, and what is known of the scene."""
 
-    train: tuple[PosedPhoto, ...]
-    test: tuple[PosedPhoto, ...] | None
-    """Photos that the file holds out; None if it does not say."""
-    points_in_world: Float[np.ndarray, "p 3"]
+    photos: PosedPhotos
+    """All photos that are there, with the paths of their files."""
+    splits: Mapping[str, Int[np.ndarray, "_"]] = field(default_factory=dict)
+    """Indices of the photos that the files call train, val or test; empty: they do not say."""
+    points_in_world: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Known points; may be none."""
     box: Float[np.ndarray, "2 3"] | None = None
     """Lower and upper corner of all there is, in the world; None: unknown, or without bounds."""
+    depth_range: tuple[float, float] | None = None
+    """Where rays begin and end, in the units of the world, if the format says so."""
+    model: Reconstruction | None = None
+    """The reconstruction that the photos are views of, if they are."""
+    view_of_photo: Int[np.ndarray, "v"] | None = None
+    """The view of that model that each photo is."""
+    problems: tuple[PhotoProblem, ...] = ()
+    """Photos that the files name and that are missing or no images."""
+
+    def held_out(self) -> Int[np.ndarray, "_"]:
+        """Photos that the files call test, else val; may be none."""
+        return next((self.splits[name] for name in ("test", "val") if len(self.splits.get(name, ()))), NO_PHOTO)
+
+
+NO_PHOTO = np.empty(0, dtype=np.int64)
 
 
 def rigid_from_gl(matrix: np.ndarray) -> Rigid3:
