@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.space import box_space
 from fieldstone.field.grid.decoder import decoder_width, initial_decoder
@@ -51,6 +52,12 @@ def ball_pixels(camera, pose):
     normals = rays.origins + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * rays.directions
     rgba = np.concatenate([0.5 + 0.5 * normals, (discriminant > 0)[:, None]], axis=1)
     return np.rint(255 * np.clip(rgba, 0, 1)).astype(np.uint8).reshape(camera.height, camera.width, 4)
+
+
+def psnr_of_one_color(photos, photo, background=FRAME.background):
+    """What the best single colour comes to, in dB: who learns something of the photo is above it."""
+    shown = photos.composited(photo, background)
+    return psnr(np.broadcast_to(shown.mean(axis=(0, 1)), shown.shape), shown)
 
 
 def random_field(rng, resolutions=(3, 6, 12), max_levels=4, density_bias=0.0):

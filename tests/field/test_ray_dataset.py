@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,6 +97,17 @@ def test_background_of_photos_without_alpha_is_their_mean_colour():
     photos = random_photos(simple_camera(), channels=(3, 3))
     expected = np.concatenate([pixels.reshape(-1, 3) for pixels in photos.pixels]).mean(axis=0) / 255
     np.testing.assert_allclose(default_background(photos), expected, rtol=1e-12)
+
+
+def test_background_is_the_mean_of_what_masks_leave():
+    photos = random_photos(simple_camera(), channels=(3,))
+    (pixels,) = photos.pixels
+    keep = np.zeros(pixels.shape[:2], dtype=bool)
+    keep[1, 2] = keep[0, 1] = True
+    expected = (pixels[1, 2].astype(float) + pixels[0, 1]) / 2 / 255
+    np.testing.assert_allclose(default_background(replace(photos, keep=(keep,))), expected, rtol=1e-12)
+    hidden = replace(photos, keep=(np.zeros_like(keep),))
+    np.testing.assert_array_equal(default_background(hidden), np.full(3, 0.5))
 
 
 @pytest.mark.parametrize(("size", "new_size"), [(6, 3), (7, 3), (5, 4), (5, 5), (9, 1)])

@@ -1,5 +1,7 @@
+import itertools
 import json
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from fieldstone.run import fast_fields, fast_stages
 from fieldstone.run.fast_fields import size_in_memory, train_fast_run
 from fieldstone.run.fields import split_tensors
 from fieldstone.scene.photos import posed_photos
-from grid_scenes import ball_photos
+from grid_scenes import ball_photos, psnr_of_one_color
 
 CAMERA_12_MP = Camera("SIMPLE_PINHOLE", 4000, 3000, np.array([3000.0, 2000.0, 1500.0]))
 
@@ -48,13 +50,16 @@ def write_plan(path, steps=5):
     return path
 
 
-def test_a_budget_is_kept_and_leaves_its_plan(ball_folder, tmp_path):
+def test_a_budget_is_kept_and_leaves_its_plan(ball_folder, tmp_path, monkeypatch):
+    """By a clock that goes on by a hundredth of a second whenever it is read, so that the machine has no say."""
+    ticks = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.01 * next(ticks))
     metrics = train_fast_run(ball_folder, tmp_path / "out", budget_s=3.0, threads=1)
-    # Twice the budget: a step of the plan may take longer than those that were measured, on a busy machine.
-    assert metrics["seconds"] < 6.0
+    assert 1.5 < metrics["seconds"] <= 3.0
     plan = metrics["plan"]
     assert metrics["steps"] == min(sum(plan["steps"]), plan["stop_after"] or sum(plan["steps"]))
-    assert metrics["psnr"] > 12.0
+    # Half the error of the best single colour.
+    assert metrics["psnr"] > psnr_of_one_color(ball_photos(10), 0) + 20 * np.log10(2)
     assert (tmp_path / "out" / "renders" / "test" / "r_0.png").is_file()
     assert json.loads((tmp_path / "out" / "plan.json").read_text()) == json.loads(json.dumps(metrics["plan"]))
 

@@ -1,6 +1,8 @@
 """`train` on a reconstruction: known points, exposures and masks through the whole pipeline."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from fieldstone.errors import InputError
 from fieldstone.evaluate.image_metrics import psnr
 from fieldstone.field.grid_training.budget import first_plan
 from fieldstone.geometry.camera import image_from_cam
+from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
 from fieldstone.run.fast_fields import train_fast_run
@@ -58,7 +61,28 @@ def write_plan(path):
     return path
 
 
-def test_masks_are_kept_out_of_training_and_of_the_measures(ball_model, tmp_path):
+def test_nothing_is_learned_from_what_masks_hide(ball_model, tmp_path):
+    """Photos that differ only under the masks train the same field, bit by bit; without masks they do not."""
+    plan = write_plan(tmp_path / "plan.json")
+    painted = shutil.copytree(ball_model, tmp_path / "painted")
+    for path in (painted / "images").iterdir():
+        pixels = read_photo(path).rgb.copy()
+        # Not the row beside the mask's edge: colours at known points are interpolated from both sides of it.
+        pixels[WHITE_ROWS + 1 :] = 255 - pixels[WHITE_ROWS + 1 :]
+        write_photo(path, pixels)
+    names = (ball_model.name, painted.name)
+    for kind, masks in {"masked": Path("white"), "bare": None}.items():
+        for folder in (ball_model, painted):
+            out = tmp_path / kind / folder.name
+            train_fast_run(folder, out, plan=plan, threads=1, masks=masks and folder / masks, max_steps=30)
+    for kind, same in {"masked": True, "bare": False}.items():
+        # The header names the folder; tensors are what was learned.
+        one, other = (read_checkpoint(tmp_path / kind / name / "checkpoint.safetensors")[0] for name in names)
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(one[name], other[name]) for name in one) == same
+
+
+def test_masks_are_kept_out_of_the_measures(ball_model, tmp_path):
     plan = write_plan(tmp_path / "plan.json")
     metrics = train_fast_run(ball_model, tmp_path / "out", plan=plan, threads=1, masks=ball_model / "white")
     assert "masks are white" in metrics["protocol"]

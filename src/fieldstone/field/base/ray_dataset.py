@@ -289,11 +289,13 @@ def frame_around(
 
 
 def default_background(photos: DecodedPhotos) -> Float[np.ndarray, "3"]:
-    """White where the photos have an alpha channel, else the mean colour of the photos.
+    """White where the photos have an alpha channel, else the mean colour of what masks leave of the photos.
 
     Without alpha, whatever light passes the field must look like something; the mean colour is the guess with the
     least error, and a black one would tempt a young field to fade to black everywhere.
     """
     if any(pixels.shape[2] == 4 for pixels in photos.pixels):
         return np.array(WHITE)
-    return np.mean([pixels.reshape(-1, 3).mean(axis=0) for pixels in photos.pixels], axis=0) / 255.0
+    seen = [pixels if keep is None else pixels[keep] for pixels, keep in zip(photos.pixels, photos.keep, strict=True)]
+    means = [pixels.reshape(-1, 3).mean(axis=0) for pixels in seen if pixels.size]
+    return np.mean(means, axis=0) / 255.0 if means else np.full(3, 0.5)
