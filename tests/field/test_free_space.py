@@ -8,12 +8,11 @@ from fieldstone.field.base.projection import projection_for
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, SeenPoints
 from fieldstone.field.base.space import contracted_space, grid_from_normalized, projective_space
 from fieldstone.field.evidence.free_space import (
-    FREE_FRACTION,
-    FREE_LOSS_FRACTION,
     carve_free_space,
     corners_in_world,
     free_distances,
 )
+from fieldstone.field.evidence.options import FreeSpaceOptions
 from fieldstone.field.grid.occupancy import full_box
 from fieldstone.geometry.camera import image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
@@ -82,7 +81,7 @@ def test_what_no_photo_sees_is_empty_around_a_camera_only():
     of_cell = np.stack([corners[1 - i :, 1 - j :, 1 - k :][:48, :48, :48] for i, j, k in np.ndindex(2, 2, 2)])
     behind, away = (of_cell[..., 2] < 0).all(axis=0), np.linalg.norm(of_cell, axis=-1)
     # The wall is 4 away from both cameras, which are 0.05 apart.
-    around = behind & (away.max(axis=0) < FREE_FRACTION * WALL)
+    around = behind & (away.max(axis=0) < FreeSpaceOptions().free_fraction * WALL)
     elsewhere = behind & (away.min(axis=0) > WALL)
     assert around.sum() > 1000
     assert elsewhere.sum() > 1000
@@ -137,7 +136,21 @@ def test_photos_probably_see_nearly_as_far_as_the_points_around():
         rays = rays_from_view(CAMERA, photos.pose_of(v))
         true = 0.5 * WALL / rays.directions[:, 2]
         # Blocks of pixels take the least of the points around them.
-        assert np.all(found < FREE_LOSS_FRACTION * true * 1.02)
-        assert np.median(found / true) > 0.95 * FREE_LOSS_FRACTION
+        assert np.all(found < FreeSpaceOptions().free_loss_fraction * true * 1.02)
+        assert np.median(found / true) > 0.95 * FreeSpaceOptions().free_loss_fraction
     unknown = free_distances(photos, frame, [None, None])(0)
     np.testing.assert_array_equal(unknown, np.zeros(CAMERA.width * CAMERA.height))
+
+
+def test_a_photo_with_too_few_points_carves_nothing_until_fewer_are_asked_for():
+    """min_points is an option: what it says decides whether the photos of the wall say anything."""
+    photos, seen = wall_scene(2)
+    start = box()
+    kept, carved = (
+        carve_free_space(start, photos, FRAME, seen, contracted_space(), WORKER, FreeSpaceOptions(min_points=n))
+        for n in (10**6, 20)
+    )
+    np.testing.assert_array_equal(kept.cells, start.cells)
+    assert carved.cells.sum() < start.cells.sum()
+    with pytest.raises(ValueError, match="min_points"):
+        FreeSpaceOptions(min_points=0)

@@ -11,10 +11,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
 from fieldstone.field.base.space import Space
+from fieldstone.field.evidence.options import DEFAULT_EVIDENCE, FloaterOptions
 from fieldstone.field.grid.occupancy import Occupancy, grown_by_one
-
-MAX_FLOATING_FRACTION = 0.3
-"""If more of what is solid were to go than this share, the points do not speak for the scene."""
 
 CORNERS_TOO = np.ones((3, 3, 3))
 """Cells that share a corner touch."""
@@ -25,14 +23,15 @@ def without_floaters(
     solid: Bool[np.ndarray, "x y z"],
     points_in_grid: Float[np.ndarray, "p 3"],
     space: Space,
+    options: FloaterOptions = DEFAULT_EVIDENCE.floaters,
 ) -> Occupancy:
     """The occupancy without the pieces of solid cells that are tied to nothing, and without the rim around them.
 
     A piece is tied if there is a known point in it or beside it, or if it reaches the contracted surroundings: what is
-    far away is often seen without any point on it. Where `MAX_FLOATING_FRACTION` is exceeded, everything stays.
+    far away is often seen without any point on it. Where `FloaterOptions.max_fraction` is exceeded, everything stays.
 
     Args:
-        places: Of known points, in the grid.
+        points_in_grid: Triangulated points.
     """
     shape = np.array(solid.shape)
     cell = np.floor((points_in_grid - occupancy.lower) / occupancy.cell_size)
@@ -51,6 +50,6 @@ def without_floaters(
     tied[0] = False
     kept = tied[pieces]
     floating = solid & ~kept
-    if np.count_nonzero(floating) > MAX_FLOATING_FRACTION * np.count_nonzero(solid):
+    if np.count_nonzero(floating) > options.max_fraction * np.count_nonzero(solid):
         return occupancy
     return Occupancy(occupancy.lower, occupancy.cell_size, occupancy.cells & ~(grown_by_one(floating) & ~kept))

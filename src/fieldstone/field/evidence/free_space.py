@@ -15,38 +15,15 @@ from scipy.spatial import KDTree
 from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import SeenPoints
 from fieldstone.field.base.space import Space, normalized_from_grid
+from fieldstone.field.evidence.options import DEFAULT_EVIDENCE, FreeSpaceOptions
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.photos import PosedPhotos
 from fieldstone.scene.rays import pixel_centers
 
-FREE_FRACTION = 0.7
-"""Space is empty up to this share of the distance of known points: what has none may stand before them."""
-
-FREE_LOSS_FRACTION = 0.92
-"""And probably up to this share of the least distance of the points around."""
-
-NEIGHBOURS = 8
-"""Known points in a photo that speak for the pixels near them."""
-
-BLOCKS = 48
-"""They are found for so many blocks along the longer side of the photo."""
-
 FARTHEST = 1e4
 """What is further away, in units of the frame, is at infinity."""
-
-MIN_PHOTOS, MANY_PHOTOS = 3, 8
-"""What is nearer to a photo than most of its points is seen by so many photos, if there are so many; else by 2."""
-
-NEAR_PERCENT = 90.0
-"""Percentile of the distances of its points up to which a place is near to a photo."""
-
-AROUND_PERCENT = 5.0
-"""Up to `FREE_FRACTION` of this percentile of the distances of its points, a place is around a photo."""
-
-MIN_SEEN = 20
-"""Fewer points of a photo say nothing of its space."""
 
 
 def carve_free_space(
@@ -56,6 +33,7 @@ def carve_free_space(
     seen: Sequence[SeenPoints | None],
     space: Space,
     executor: Executor,
+    options: FreeSpaceOptions = DEFAULT_EVIDENCE.free_space,
 ) -> Occupancy:
     """The occupancy without cells that photos look through.
 
@@ -78,12 +56,12 @@ def carve_free_space(
         # nan, behind the camera, is not inside.
         inside = np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=1)
         free, near, around = np.zeros((3, len(positions)), dtype=bool)
-        if points is not None and len(points.xyz) >= MIN_SEEN:
+        if points is not None and len(points.xyz) >= options.min_points:
             distances = np.linalg.norm(points.xyz - pose.target_origin_in_source(), axis=1)
-            least = least_distance(camera, pose, points.xyz, distances, pixels[inside])
-            free[inside] = away[inside] < FREE_FRACTION * least
-            near = inside & (away < np.percentile(distances, NEAR_PERCENT))
-            around = away < FREE_FRACTION * np.percentile(distances, AROUND_PERCENT)
+            least = least_distance(camera, pose, points.xyz, distances, pixels[inside], options)
+            free[inside] = away[inside] < options.free_fraction * least
+            near = inside & (away < np.percentile(distances, options.near_percent))
+            around = away < options.free_fraction * np.percentile(distances, options.around_percent)
         # A photo may see a part of a cell, but none of its corners.
         spans = [[of_corners(pixels[:, axis], combine) for combine in (np.fmin, np.fmax)] for axis in (0, 1)]
         (left, right), (top, bottom) = spans
@@ -103,13 +81,16 @@ def carve_free_space(
         near_some |= near
         parts_seen |= part
         around_some |= around
-    cells &= ~(near_some & (times_seen < (MIN_PHOTOS if len(photos) >= MANY_PHOTOS else 2)))
+    cells &= ~(near_some & (times_seen < (options.min_views if len(photos) >= options.many_photos else 2)))
     cells &= ~around_some | parts_seen
     return Occupancy(occupancy.lower, occupancy.cell_size, cells)
 
 
 def free_distances(
-    photos: PosedPhotos, frame: FieldFrame, seen: Sequence[SeenPoints | None]
+    photos: PosedPhotos,
+    frame: FieldFrame,
+    seen: Sequence[SeenPoints | None],
+    options: FreeSpaceOptions = DEFAULT_EVIDENCE.free_space,
 ) -> Callable[[int], Float[np.ndarray, "p"]]:
     """How far every pixel of photo v probably sees, in the frame; 0 where too little is known.
 
@@ -118,11 +99,11 @@ def free_distances(
 
     def of_photo(v: int) -> Float[np.ndarray, "p"]:
         camera, pose, points = photos.camera_of(v), photos.pose_of(v), seen[v]
-        if points is None or len(points.xyz) < MIN_SEEN:
+        if points is None or len(points.xyz) < options.min_points:
             return np.zeros(camera.width * camera.height, dtype=np.float32)
         distances = np.linalg.norm(points.xyz - pose.target_origin_in_source(), axis=1)
-        least = least_distance(camera, pose, points.xyz, distances, pixel_centers(camera.width, camera.height))
-        return (FREE_LOSS_FRACTION * frame.normalized_from_world.scale * least).astype(np.float32)
+        least = least_distance(camera, pose, points.xyz, distances, pixel_centers(camera.width, camera.height), options)
+        return (options.free_loss_fraction * frame.normalized_from_world.scale * least).astype(np.float32)
 
     return of_photo
 
@@ -133,17 +114,18 @@ def least_distance(
     points: Float[np.ndarray, "p 3"],
     distances: Float[np.ndarray, "p"],
     pixels: Float[np.ndarray, "n 2"],
+    options: FreeSpaceOptions = DEFAULT_EVIDENCE.free_space,
 ) -> Float[np.ndarray, "n"]:
-    """Of the `NEIGHBOURS` known points that are nearest to each pixel in the photo, how far the nearest one is.
+    """Of the points that are nearest to each pixel in the photo (`neighbours` of them), how far the nearest one is.
 
     Args:
         points: In the world; distances: from the camera.
     """
     size = np.array([camera.width, camera.height])
-    block = size.max() / BLOCKS
+    block = size.max() / options.blocks
     centers = np.stack(np.meshgrid(*(np.arange(np.ceil(n / block)) for n in size), indexing="ij"), axis=-1)
     tree = KDTree(image_from_cam(camera, cam_from_world.apply(points)))
-    _, nearest = tree.query((centers.reshape(-1, 2) + 0.5) * block, k=NEIGHBOURS)
+    _, nearest = tree.query((centers.reshape(-1, 2) + 0.5) * block, k=options.neighbours)
     least = distances[nearest].min(axis=1).reshape(centers.shape[:2])
     i, j = np.minimum((pixels / block).astype(np.int64), np.array(least.shape) - 1).T
     return least[i, j]

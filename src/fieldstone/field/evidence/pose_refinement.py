@@ -19,31 +19,12 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, surface_depth
 from fieldstone.field.base.ray_dataset import SeenPoints, reduce_photos
+from fieldstone.field.evidence.options import DEFAULT_EVIDENCE, PoseOptions
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.jacobian import image_from_world_jacobian
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.scene.photos import DecodedPhotos
 from fieldstone.scene.rays import Rays, rays_from_view
-
-SIZE_PX = 112
-"""Longer side of the pictures that are compared."""
-
-SIGMA_PX = 0.5
-"""Standard deviation of a known point in a photo, in pixels of the photo."""
-
-MIN_POINTS, UNKNOWN_SIGMA_PX = 20, 3.0
-"""Photos that see fewer are held as if they saw the corners of a cube in the middle of the scene, this exactly."""
-
-SAME_ERROR = 30.0
-"""Neighbouring pixels are wrong together: so many count as one."""
-
-MIN_OPACITY = 0.5
-
-MAX_DEPTH_RATIO = 1.1
-"""Neighbouring pixels whose depths differ more do not lie on one surface."""
-
-LEAST_SIGMA = 0.004
-"""Colours in 8 bits are not known better than to one level."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +34,15 @@ class RefinablePoses:
     photos: DecodedPhotos
     information: Float[np.ndarray, "v 6 6"]
     """What the known points say of each pose: the inverse covariance of a tangent (omega, v), see `Rigid3.retract`."""
+    options: PoseOptions = DEFAULT_EVIDENCE.poses
 
 
-def refinable_poses(photos: DecodedPhotos, frame: FieldFrame, seen: Sequence[SeenPoints | None]) -> RefinablePoses:
+def refinable_poses(
+    photos: DecodedPhotos,
+    frame: FieldFrame,
+    seen: Sequence[SeenPoints | None],
+    options: PoseOptions = DEFAULT_EVIDENCE.poses,
+) -> RefinablePoses:
     """The photos as they are compared, and what holds them.
 
     Args:
@@ -66,13 +53,13 @@ def refinable_poses(photos: DecodedPhotos, frame: FieldFrame, seen: Sequence[See
     information = np.empty((len(photos), 6, 6))
     for v in range(len(photos)):
         known = seen[v] if seen else None
-        points, sigma_px = middle, UNKNOWN_SIGMA_PX
-        if known is not None and len(known.xyz) >= MIN_POINTS:
-            points, sigma_px = known.xyz, SIGMA_PX
+        points, sigma_px = middle, options.unknown_sigma_px
+        if known is not None and len(known.xyz) >= options.min_points:
+            points, sigma_px = known.xyz, options.sigma_px
         J = image_from_world_jacobian(photos.posed.camera_of(v), photos.posed.pose_of(v), points).by_pose
         J = J[np.isfinite(J).all(axis=(1, 2))]
         information[v] = np.einsum("nki,nkj->ij", J, J) / sigma_px**2
-    return RefinablePoses(reduce_photos(photos, SIZE_PX), information)
+    return RefinablePoses(reduce_photos(photos, options.size_px), information, options)
 
 
 def refined(
@@ -85,7 +72,7 @@ def refined(
     """One step for every photo; a step that does not bring the pictures together is not taken.
 
     Args:
-        moved: Tangents from the given poses to those of now.
+        pose_deltas: Tangents from the given poses to those of now.
         render_rays: Of the field, for rays in the world.
         gains: What each photo multiplies colours by.
         background: Behind photos with alpha.
@@ -94,17 +81,19 @@ def refined(
         The tangents after the step.
     """
     out = pose_deltas.copy()
-    photos = refinable.photos
+    photos, options = refinable.photos, refinable.options
     for v, information in enumerate(refinable.information):
         target = photos.composited(v, background).reshape(-1, 3)
-        here = _compare(photos, v, pose_deltas[v], render_rays, gains[v], target)
-        step = _step(photos.posed.camera_of(v), information, pose_deltas[v], here)
+        here = _compare(photos, v, pose_deltas[v], render_rays, gains[v], target, options)
+        step = _step(photos.posed.camera_of(v), information, pose_deltas[v], here, options)
         if step is None:
             continue
-        there = _compare(photos, v, pose_deltas[v] + step, render_rays, gains[v], target)
+        there = _compare(photos, v, pose_deltas[v] + step, render_rays, gains[v], target, options)
         both = here.usable & there.usable
         sigma, after = here.sigma, pose_deltas[v] + step
-        if _cost(there, both, sigma, information, after) < _cost(here, both, sigma, information, pose_deltas[v]):
+        if _cost(there, both, sigma, information, after, options) < _cost(
+            here, both, sigma, information, pose_deltas[v], options
+        ):
             out[v] += step
     return out
 
@@ -130,16 +119,23 @@ class _Comparison:
     residual: Float[np.ndarray, "p 3"]
     usable: Bool[np.ndarray, "p"]
     points: Float[np.ndarray, "p 3"]
+    min_sigma: float
 
     @property
     def sigma(self) -> float:
         """Of the residuals; not their median: the few pixels on edges and texture are what tells of the pose."""
         some = self.residual[self.usable]
-        return max(float(np.sqrt(np.mean(some**2))) if some.size else 1.0, LEAST_SIGMA)
+        return max(float(np.sqrt(np.mean(some**2))) if some.size else 1.0, self.min_sigma)
 
 
 def _compare(
-    photos: DecodedPhotos, v: int, tangent: np.ndarray, render_rays: RayRenderer, gain: np.ndarray, target: np.ndarray
+    photos: DecodedPhotos,
+    v: int,
+    tangent: np.ndarray,
+    render_rays: RayRenderer,
+    gain: np.ndarray,
+    target: np.ndarray,
+    options: PoseOptions,
 ) -> _Comparison:
     camera, keep = photos.posed.camera_of(v), photos.keep[v]
     pose = photos.posed.pose_of(v).retract(tangent)
@@ -147,11 +143,11 @@ def _compare(
     reached = np.flatnonzero(np.isfinite(rays.directions).all(axis=1))
     rendered = _rendered(render_rays, rays, reached)
     shown = rendered.rgb.astype(np.float64) * gain
-    usable = _inside_surfaces(camera, rendered)
+    usable = _inside_surfaces(camera, rendered, options)
     if keep is not None:
         usable &= keep.reshape(-1)
     points = rays.origins + rays.directions * rendered.depth[:, None]
-    return _Comparison(pose, rendered, shown, target - shown, usable, points)
+    return _Comparison(pose, rendered, shown, target - shown, usable, points, options.min_sigma)
 
 
 def _rendered(render_rays: RayRenderer, rays: Rays, rows: Int[np.ndarray, "k"]) -> RenderedRays:
@@ -162,16 +158,18 @@ def _rendered(render_rays: RayRenderer, rays: Rays, rows: Int[np.ndarray, "k"]) 
     return RenderedRays(rgb, depth, opacity)
 
 
-def _inside_surfaces(camera: Camera, rendered: RenderedRays) -> Bool[np.ndarray, "p"]:
+def _inside_surfaces(camera: Camera, rendered: RenderedRays, options: PoseOptions) -> Bool[np.ndarray, "p"]:
     """Pixels that lie on one surface with their neighbours: across an edge the picture does not flow, it is hidden."""
     shape = camera.height, camera.width
-    opaque = rendered.opacity.reshape(shape) > MIN_OPACITY
+    opaque = rendered.opacity.reshape(shape) > options.min_opacity
     depth = np.where(opaque, rendered.depth.reshape(shape).astype(np.float64), np.inf)
     nearest, farthest = minimum_filter(depth, 3, mode="nearest"), maximum_filter(depth, 3, mode="nearest")
-    return (farthest < MAX_DEPTH_RATIO * nearest).reshape(-1)
+    return (farthest < options.max_depth_ratio * nearest).reshape(-1)
 
 
-def _step(camera: Camera, information: np.ndarray, tangent: np.ndarray, here: _Comparison) -> np.ndarray | None:
+def _step(
+    camera: Camera, information: np.ndarray, tangent: np.ndarray, here: _Comparison, options: PoseOptions
+) -> np.ndarray | None:
     """The minimum of the linearised squares; None where nothing can be compared."""
     grid = here.shown.reshape(camera.height, camera.width, 3)
     if min(grid.shape[:2]) < 3 or not here.usable.any():
@@ -184,7 +182,7 @@ def _step(camera: Camera, information: np.ndarray, tangent: np.ndarray, here: _C
     r = here.residual[here.usable].reshape(-1)
     good = np.isfinite(G).all(axis=1)
     G, r = G[good], r[good]
-    weight = 1.0 / (1.0 + (r / here.sigma) ** 2) / (SAME_ERROR * here.sigma**2)
+    weight = 1.0 / (1.0 + (r / here.sigma) ** 2) / (options.correlated_pixels * here.sigma**2)
     A = (G * weight[:, None]).T @ G + information
     b = G.T @ (weight * r) + information @ tangent
     try:
@@ -193,7 +191,14 @@ def _step(camera: Camera, information: np.ndarray, tangent: np.ndarray, here: _C
         return None
 
 
-def _cost(at: _Comparison, usable: np.ndarray, sigma: float, information: np.ndarray, tangent: np.ndarray) -> float:
+def _cost(
+    at: _Comparison,
+    usable: np.ndarray,
+    sigma: float,
+    information: np.ndarray,
+    tangent: np.ndarray,
+    options: PoseOptions,
+) -> float:
     """Robust mean of the squared differences, as many as there are, and what the known points pay."""
     r = at.residual[usable] / sigma
-    return float(0.5 * np.log1p(r**2).sum() / SAME_ERROR + 0.5 * tangent @ information @ tangent)
+    return float(0.5 * np.log1p(r**2).sum() / options.correlated_pixels + 0.5 * tangent @ information @ tangent)

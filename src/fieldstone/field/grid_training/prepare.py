@@ -15,6 +15,7 @@ from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS, SeenPoints
 from fieldstone.field.base.space import Space, box_space, contracted_space, grid_from_normalized, projective_space
 from fieldstone.field.evidence.free_space import carve_free_space, free_distances
+from fieldstone.field.evidence.options import DEFAULT_EVIDENCE, EvidenceOptions
 from fieldstone.field.evidence.pose_refinement import refinable_poses
 from fieldstone.field.evidence.sparse_depth import no_sparse_depth_rays, sparse_depth_rays
 from fieldstone.field.grid.field import occupancy_box
@@ -46,6 +47,7 @@ def prepare_grid_training(
     seen: Sequence[SeenPoints | None] = (),
     bounded: bool = True,
     refine_poses: bool = False,
+    evidence: EvidenceOptions = DEFAULT_EVIDENCE,
 ) -> GridTraining:
     """The training of a grid field on posed photos.
 
@@ -58,6 +60,7 @@ def prepare_grid_training(
         seen: Those that each photo observes; empty: nothing is known of any.
         bounded: Nothing lies beyond the box.
         use_alpha: False takes photos with alpha as photos on the background of the frame.
+        evidence: How far photos and points are believed.
         refine_poses: Keep what a plan with `refine_poses` needs.
 
     Raises:
@@ -72,10 +75,12 @@ def prepare_grid_training(
     depth_rays, sparse_depths = no_sparse_depth_rays()
     free_distance_of = None
     if seen:
-        occupancy = carve_free_space(occupancy, photos.posed, frame, seen, space, executor)
+        occupancy = carve_free_space(occupancy, photos.posed, frame, seen, space, executor, evidence.free_space)
         logger.info("seen to be free: %.1f %% of the box", 100 * (1 - occupancy.cells.mean()))
         depth_rays, sparse_depths = sparse_depth_rays(photos, frame, seen, space)
-        free_distance_of = None if space.is_projective else free_distances(photos.posed, frame, seen)
+        free_distance_of = (
+            None if space.is_projective else free_distances(photos.posed, frame, seen, evidence.free_space)
+        )
     box = occupancy_box(occupancy, occupancy.extent, space)
     return GridTraining(
         rays=ray_table(photos, frame, box, executor, use_alpha=use_alpha, free_distance_of=free_distance_of),
@@ -89,7 +94,8 @@ def prepare_grid_training(
         executor=executor,
         points_in_grid=grid_from_normalized(space, frame.normalized_from_world.apply(points)),
         alpha_known=alpha_known,
-        refinable=refinable_poses(photos, frame, seen) if refine_poses else None,
+        floaters=evidence.floaters,
+        refinable=refinable_poses(photos, frame, seen, evidence.poses) if refine_poses else None,
     )
 
 

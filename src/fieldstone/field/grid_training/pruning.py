@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fieldstone.field.evidence.floaters import without_floaters
+from fieldstone.field.evidence.options import FloaterOptions
 from fieldstone.field.grid.field import GridField
 from fieldstone.field.grid.occupancy import Occupancy
 from fieldstone.field.grid.occupancy_numba import used_cells
@@ -42,14 +43,16 @@ def without_empty_cells(field: GridField, density: float, executor: Executor) ->
     return replace(field, occupancy=replace(occupancy, cells=cells))
 
 
-def without_floating_cells(field: GridField, points_in_grid: Float[np.ndarray, "p 3"], executor: Executor) -> GridField:
+def without_floating_cells(
+    field: GridField, points_in_grid: Float[np.ndarray, "p 3"], options: FloaterOptions, executor: Executor
+) -> GridField:
     """The field without solid pieces that are tied to nothing.
 
     Args:
         points_in_grid: Triangulated points.
     """
     solid = denser_cells(field, field.occupancy, SOLID_DEPTH / field.step_depth, executor)
-    occupancy = without_floaters(field.occupancy, solid, points_in_grid, field.space)
+    occupancy = without_floaters(field.occupancy, solid, points_in_grid, field.space, options)
     cleared = np.count_nonzero(field.occupancy.cells) - np.count_nonzero(occupancy.cells)
     logger.debug("cleared %d cells around what hangs in the air", cleared)
     return replace(field, occupancy=occupancy)

@@ -21,6 +21,7 @@ from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, StepReport, in_world
 from fieldstone.field.base.ray_dataset import poses_in_frame
 from fieldstone.field.base.space import Space
+from fieldstone.field.evidence.options import DEFAULT_EVIDENCE, FloaterOptions
 from fieldstone.field.evidence.pose_refinement import RefinablePoses, at_surfaces, refined
 from fieldstone.field.grid.decoder import HIDDEN, Decoder, decoder_width, initial_decoder
 from fieldstone.field.grid.exposure import gains_of, step_exposure, unit_exposure
@@ -93,6 +94,8 @@ class GridTraining:
     """All triangulated points."""
     alpha_known: bool
     """Photos say themselves where they show the background."""
+    floaters: FloaterOptions = DEFAULT_EVIDENCE.floaters
+    """What counts as hanging in the air."""
     refinable: RefinablePoses | None = None
     """The photos whose poses may be refined; None, if they may not."""
 
@@ -266,7 +269,7 @@ class GridTraining:
         threshold = initial if stage >= schedule.clear_initial_density_from else 0.0
         field = without_empty_cells(field, max(schedule.prune_density, threshold), self.executor)
         if schedule.clear_floaters_from <= stage and into_stage == 0 and len(self.points_in_grid):
-            field = without_floating_cells(field, self.points_in_grid, self.executor)
+            field = without_floating_cells(field, self.points_in_grid, self.floaters, self.executor)
         return replace(state, field=field, buffers=replace(state.buffers, box=field.box()))
 
     def _with_refined_poses(self, state: GridState, refinable: RefinablePoses) -> GridState:
