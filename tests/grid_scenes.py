@@ -60,6 +60,10 @@ def psnr_of_one_color(photos, photo, background=FRAME.background):
     return psnr(np.broadcast_to(shown.mean(axis=(0, 1)), shown.shape), shown)
 
 
+THIRD_OF_ERROR_DB = 20 * np.log10(3)
+"""What a field that has learned a scene is asked for: at most a third of the error of the best single colour."""
+
+
 def random_field(rng, resolutions=(3, 6, 12), max_levels=4, density_bias=0.0):
     """A field with density everywhere."""
     occupancy = full_box(np.array([-1.0, -0.7, -0.5]), np.array([2.0, 1.5, 1.0]), 8)
