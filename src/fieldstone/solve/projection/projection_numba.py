@@ -142,7 +142,7 @@ def image_from_cam_numba(model, params, x, y, z, J_point, J_params, J_k):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def robust_numba(loss, scale2, s):
-    """(rho, weight) of a squared residual; loss 0 trivial, 1 Huber, 2 soft L1, 3 Cauchy: `robust_loss`."""
+    """(rho, weight) of a squared residual; loss 0 trivial, 1 Huber, 2 soft L1, 3 Cauchy: `robust.loss`."""
     if loss == 0:
         return s, 1.0
     q = s / scale2
