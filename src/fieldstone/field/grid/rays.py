@@ -54,7 +54,7 @@ def ray_table(
 
     Args:
         use_alpha: False composites the photos on the background of the frame and forgets their alpha.
-        free_of: How far every pixel of photo v probably sees, see `RayTable.free_distance`.
+        free_distance_of: How far every pixel of photo v probably sees, see `RayTable.free_distance`.
 
     Raises:
         InputError: No ray meets the box.

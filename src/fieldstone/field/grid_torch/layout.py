@@ -84,7 +84,7 @@ def step_rows(
 
     Args:
         rows: Each once.
-        kept: What each level keeps of itself, by channel.
+        decay_factors: What weight decay leaves of each level, by channel.
     """
     vertices, mean_square = grid.vertices[rows], grid.mean_square[rows]
     v = decay * mean_square + (1.0 - decay) * gradient**2
