@@ -1,6 +1,7 @@
 """What got slower or worse since a baseline: `python -m benchmarks.compare BASELINE [NEW] [--slack 1.0]`.
 
-BASELINE and NEW are files of rows or folders of them; NEW is `benchmarks/results` where it is not given. A metric with
+BASELINE and NEW are files of rows or folders of them: `benchmarks/results` is the committed baseline, and
+`out/benchmarks`, where benchmarks write, is NEW where it is not given. A metric with
 a peer is judged by its ratio to the peer, which stays the same on a slower or busier machine; another one by its value,
 and only where both were measured on one machine. The exit code is 1 where anything got worse.
 """
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from benchmarks.rows import RESULTS, Row, read_rows
+from benchmarks.rows import NEW_ROWS, Row, read_rows
 
 Verdict = Literal["worse", "better", "same", "gone", "new", "not comparable"]
 
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print every change, worse ones first, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("baseline", type=Path)
-    parser.add_argument("new", type=Path, nargs="?", default=RESULTS)
+    parser.add_argument("new", type=Path, nargs="?", default=NEW_ROWS)
     parser.add_argument("--slack", type=float, default=1.0, help="times the tolerance of every metric")
     given = parser.parse_args(arguments)
     changes = compare(read_rows(given.baseline), read_rows(given.new), given.slack)

@@ -22,8 +22,9 @@ Better = Literal["lower", "higher"]
 TIMES, QUALITY = 0.15, 0.02
 """How much a time scatters on a busy machine, and a number that only another choice of order or seed moves."""
 
-RESULTS = Path(__file__).parent / "results"
 ROOT = Path(__file__).resolve().parents[1]
+NEW_ROWS = ROOT / "out" / "benchmarks"
+"""Where rows go; those of `benchmarks/results` are the baseline, and change in a commit that says why."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,8 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def add_out_option(parser: argparse.ArgumentParser, name: str) -> None:
-    """Give a benchmark the option --out, a file for its rows; the default is `benchmarks/results/NAME.json`."""
-    parser.add_argument("--out", type=Path, default=RESULTS / f"{name}.json", help="file for the rows (JSON)")
+    """Give a benchmark the option --out, a file for its rows; the default is `out/benchmarks/NAME.json`."""
+    parser.add_argument("--out", type=Path, default=NEW_ROWS / f"{name}.json", help="file for the rows (JSON)")
 
 
 def commit() -> str:

@@ -6,7 +6,6 @@ from fieldstone.evaluate.reconstruction_metrics import (
     area_under_curve,
     pairwise_pose_errors_deg,
     relative_pose_errors,
-    track_lengths,
 )
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp, random_rotation
@@ -62,8 +61,3 @@ def test_area_under_curve_matches_integration_of_the_recall():
         recall = np.searchsorted(np.sort(errors), grid * threshold, side="right") / 50
         np.testing.assert_allclose(area, 100 * recall.mean(), atol=1e-3)
     assert area_under_curve(np.zeros(3), [1.0]) == [100.0]
-
-
-def test_track_lengths_count_observations():
-    truth = scene()
-    assert track_lengths(truth).sum() == len(truth.observations)

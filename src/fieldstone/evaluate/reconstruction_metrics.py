@@ -1,4 +1,4 @@
-"""How good a reconstruction is: pose errors against a reference, AUC over pairs, error and track statistics."""
+"""How good a reconstruction is: pose errors against a reference, AUC over pairs, reprojection errors."""
 
 from __future__ import annotations
 
@@ -52,8 +52,3 @@ def area_under_curve(errors: Float[np.ndarray, "n"], thresholds: Sequence[float]
     if not len(errors):
         return [float("nan")] * len(thresholds)
     return [100.0 * float(np.mean(np.maximum(0.0, 1.0 - errors / threshold))) for threshold in thresholds]
-
-
-def track_lengths(model: Reconstruction) -> Float[np.ndarray, "p"]:
-    """Number of observations of each point."""
-    return np.bincount(model.observations.point, minlength=len(model.points)).astype(np.float64)
