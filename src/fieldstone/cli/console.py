@@ -38,7 +38,7 @@ def shown_progress(console: Console) -> Iterator[OnProgress]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[detail]}"),
     )
-    with Progress(*columns, console=console, transient=True) as display:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as display:
         task: TaskID | None = None
         stage = None
 
