@@ -29,14 +29,14 @@ from fieldstone.field.grid.field import FOREVER
 from fieldstone.field.grid.interpolation_numba import add_gradient, step_by_sample, step_touched
 from fieldstone.field.grid.march_numba import march_rays
 from fieldstone.field.grid.step_numba import draw_rays
-from fieldstone.field.grid_training.plan import plan_from_json
 from fieldstone.field.grid_training.prepare import prepare_grid_training
 from fieldstone.field.grid_training.state import GridState
 from fieldstone.field.grid_training.training import GridTraining
-from fieldstone.io.files.checkpoint import read_checkpoint
-from fieldstone.run.fast_fields import MAX_SIZE_PX, train_fast_run
+from fieldstone.run.field import open_field
 from fieldstone.run.field_input import read_ray_dataset
-from fieldstone.run.fields import split_tensors
+from fieldstone.run.grid_planning import MAX_SIZE_PX
+from fieldstone.run.options import TrainOptions
+from fieldstone.run.train import train
 
 REPEATS = 30
 
@@ -59,19 +59,21 @@ def main() -> None:
     for budget in map(float, arguments.budgets.split(",")):
         out = folder / f"{budget:g}s"
         cpu = time.process_time()
-        metrics = train_fast_run(
-            arguments.scene, out, budget_s=budget, threads=arguments.threads, use_alpha=not arguments.no_alpha
-        )
+        options = TrainOptions(budget_s=budget, threads=arguments.threads, alpha=not arguments.no_alpha)
+        field = train(arguments.scene, options, keep_in=out)
+        metrics, plan = field.metrics, field.plan
+        assert metrics is not None
+        assert plan is not None
         show(
-            f"{budget:6g} s: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}, {metrics['seconds']:.1f} s, "
-            f"{metrics['steps']} steps, finest {metrics['plan']['finest']}, CPU {time.process_time() - cpu:.0f} s with "
+            f"{budget:6g} s: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.3f}, {metrics.seconds:.1f} s, "
+            f"{metrics.steps} steps, finest {plan.schedule.finest}, CPU {time.process_time() - cpu:.0f} s with "
             "compiling and rendering"
         )
         name = f"field/{arguments.scene.name}{'/no alpha' if arguments.no_alpha else ''}/{budget:g} s"
         rows += [
-            Row(f"{name}/psnr", metrics["psnr"], "dB", "higher", QUALITY),
-            Row(f"{name}/ssim", metrics["ssim"], "1", "higher", QUALITY),
-            Row(f"{name}/steps", metrics["steps"], "steps", "higher"),
+            Row(f"{name}/psnr", metrics.psnr, "dB", "higher", QUALITY),
+            Row(f"{name}/ssim", metrics.ssim, "1", "higher", QUALITY),
+            Row(f"{name}/steps", metrics.steps, "steps", "higher"),
         ]
     kernels = profile(arguments.scene, out, use_alpha=not arguments.no_alpha)
     rows += [Row(f"field/kernels/{kernel}", ns, "ns", "lower") for kernel, ns in kernels]
@@ -80,9 +82,9 @@ def main() -> None:
 
 def profile(scene: Path, out: Path, *, use_alpha: bool) -> list[tuple[str, float]]:
     """Nanoseconds of each kernel per sample that weighs, on the field of a run."""
-    tensors, _ = read_checkpoint(out / "checkpoint.safetensors")
-    _, state_tensors = split_tensors(tensors)
-    plan = plan_from_json(state_tensors["plan"].tobytes().decode())
+    trained = open_field(out)
+    plan = trained.plan
+    assert plan is not None
     dataset = read_ray_dataset(scene, None, MAX_SIZE_PX)
     with ThreadPoolExecutor(1) as executor:
         training = prepare_grid_training(
@@ -96,7 +98,7 @@ def profile(scene: Path, out: Path, *, use_alpha: bool) -> list[tuple[str, float
             seen=dataset.seen,
             bounded=dataset.bounded,
         )
-        rows, about = kernel_times(training, training.from_tensors(state_tensors))
+        rows, about = kernel_times(training, training.from_tensors(trained.state))
     show(about)
     for name, nanoseconds in rows:
         show(f"  {name:28s} {nanoseconds:7.1f} ns")

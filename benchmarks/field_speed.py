@@ -13,25 +13,21 @@ the last 20 batches of training rays, for the fast field only those that meet th
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.rows import Row, add_out_option, write_rows
-from fieldstone.field.base.radiance_field import in_world
+from fieldstone.field.base.budget import Budget
 from fieldstone.field.base.training import PRESETS, train
-from fieldstone.field.grid.field import field_from_tensors
-from fieldstone.field.grid.render import renderer
-from fieldstone.io.files.checkpoint import read_checkpoint
-from fieldstone.render.views import progressive_views, render_view
+from fieldstone.rendering.views import progressive_views, render_view
+from fieldstone.run.field import open_field
 from fieldstone.run.field_input import read_ray_dataset
-from fieldstone.run.fields import frame_from_header, open_training, split_tensors
-from fieldstone.run.mesh import compared_views
+from fieldstone.run.network_training import open_training
+from fieldstone.run.surface import some_views
 
 FRAMES = 12
 BATCHES = 20
@@ -63,8 +59,8 @@ def main() -> None:
     write_rows(rows, arguments.out)
     if arguments.networks <= 0:
         return
-    curve = json.loads((arguments.trained / "curve.json").read_text())
-    report("fast", [p["seconds"] for p in curve], [p["psnr"] for p in curve], arguments.target_db)
+    curve = open_field(arguments.trained).curve
+    report("fast", [p.seconds for p in curve], [p.psnr for p in curve], arguments.target_db)
     for name in ("tiny", "nerf"):
         seconds, psnr = network_curve(arguments.scene, name, arguments.networks, arguments.threads)
         report(name, seconds, psnr, arguments.target_db)
@@ -72,12 +68,9 @@ def main() -> None:
 
 def frame_seconds(out: Path, size: int, threads: int) -> tuple[float, float, float]:
     """Wall and CPU seconds of a frame of a trained fast field, and until something is seen of it; kernels compiled."""
-    tensors, header = read_checkpoint(out / "checkpoint.safetensors")
-    poses, state = split_tensors(tensors)
-    frame = frame_from_header(header)
-    with ThreadPoolExecutor(threads) as executor:
-        render = in_world(renderer(field_from_tensors(state), frame, executor), frame)
-        views = compared_views(header, poses, FRAMES, size)
+    field = open_field(out)
+    views = some_views(field.photos, FRAMES, size)
+    with field.renderer(threads=threads) as render:
         render_view(render, *views[0])
         began, began_cpu = time.perf_counter(), time.process_time()
         for camera, pose in views:
@@ -95,7 +88,7 @@ def network_curve(scene: Path, name: str, budget_s: float, threads: int) -> tupl
     options = PRESETS[name]
     dataset = read_ray_dataset(scene, None, options.image_size_px)
     with open_training(options, dataset.frame, dataset, seed=0, device="cpu", threads=threads) as training:
-        _, curve = train(training, training.start(), budget_s=budget_s)
+        _, curve = train(training, training.start(), budget=Budget.start(budget_s))
     return [p.seconds for p in curve], [p.psnr for p in curve]
 
 

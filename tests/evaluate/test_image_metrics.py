@@ -78,3 +78,31 @@ def test_bad_images_are_refused(metric, images):
 def test_ssim_refuses_images_smaller_than_its_window():
     with pytest.raises(ValueError, match="11x11"):
         ssim(np.zeros((10, 20, 3)), np.zeros((10, 20, 3)))
+
+
+def test_masked_pixels_count_nothing(images):
+    """A crop is a mask that everything agrees on: what lies outside may be anything, even the reference itself."""
+    a, b = (np.tile(image, (2, 2, 1)) for image in images)
+    keep = np.zeros(a.shape[:2], dtype=bool)
+    keep[3:20, 5:25] = True
+    outside = np.where(keep[..., None], a, b)
+    for image in (a, outside):
+        assert psnr(image, b, keep) == pytest.approx(psnr(a[3:20, 5:25], b[3:20, 5:25]), rel=1e-12)
+        assert ssim(image, b, keep) == pytest.approx(ssim(a[3:20, 5:25], b[3:20, 5:25]), rel=1e-9)
+    assert ssim(outside, b) > ssim(outside, b, keep) + 0.01
+
+
+def test_a_mask_without_a_whole_window_counts_by_centres(images):
+    a, b = images
+    keep = np.zeros(a.shape[:2], dtype=bool)
+    keep[7, 6] = True
+    window = slice(2, 13), slice(1, 12)
+    assert ssim(a, b, keep) == pytest.approx(ssim(a[window], b[window]), rel=1e-9)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_masks_that_say_nothing_are_refused(metric, images):
+    with pytest.raises(ValueError, match="keeps no pixel"):
+        metric(*images, np.zeros((16, 14), dtype=bool))
+    with pytest.raises(ValueError, match="differ in size"):
+        metric(*images, np.ones((14, 16), dtype=bool))

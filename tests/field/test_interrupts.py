@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 
+from fieldstone.field.base.budget import Budget
 from fieldstone.field.base.interrupts import deferred_interrupts
 from fieldstone.field.base.radiance_field import StepReport
 from fieldstone.field.base.training import train
@@ -39,7 +40,7 @@ def test_a_step_is_finished_before_its_checkpoint_is_written():
         train(
             TwoHalves(),
             (0, np.zeros(2)),
-            budget_s=None,
+            budget=Budget.start(None),
             max_steps=9,
             save=lambda state, curve: saved.append((state[0], *state[1], len(curve))),
         )
@@ -96,7 +97,7 @@ def test_the_state_shown_now_and_then_is_that_after_a_step():
     train(
         TwoHalves(),
         (3, np.zeros(2)),
-        budget_s=None,
+        budget=Budget.start(None),
         max_steps=4,
         show=lambda state: shown.append((state[0], *state[1])),
         show_every_s=0.0,

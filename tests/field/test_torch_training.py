@@ -6,9 +6,10 @@ import pytest
 
 from fieldstone.errors import InputError
 from fieldstone.field.base.adam import adam_estimates
+from fieldstone.field.base.budget import Budget
 from fieldstone.field.base.radiance_field import FieldFrame
 from fieldstone.field.base.ray_dataset import training_rays
-from fieldstone.field.base.training import NERF, PRESETS, TINY, TrainOptions, train
+from fieldstone.field.base.training import NERF, PRESETS, TINY, NetworkOptions, train
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import look_at
 from fieldstone.geometry.sim3 import Sim3
@@ -53,7 +54,7 @@ def training(options, workers, *, photos=None, seed=3, **settings):
 def run(options, steps, threads=1, **kwargs):
     with torch_workers(threads) as workers:
         t = training(options, workers, **kwargs)
-        state, curve = train(t, t.start(), budget_s=None, max_steps=steps)
+        state, curve = train(t, t.start(), budget=Budget.start(None), max_steps=steps)
         return t.to_tensors(state), curve
 
 
@@ -69,7 +70,7 @@ def test_resumed_training_is_bit_identical(options):
     half, curve = run(options, 4)
     with torch_workers(1) as workers:
         t = training(options, workers)
-        state, curve = train(t, t.from_tensors(half), budget_s=None, max_steps=9, curve=curve)
+        state, curve = train(t, t.from_tensors(half), budget=Budget.start(None), max_steps=9, curve=curve)
         assert_same_tensors(t.to_tensors(state), whole)
     assert [point.step for point in curve] == list(range(1, 10))
     assert np.all(np.diff([point.seconds for point in curve]) > 0)
@@ -142,7 +143,7 @@ def test_a_small_field_learns_a_ball(options):
     steps = 400
     with torch_workers(2) as workers:
         t = training(replace(options, learning_rate=5e-3, final_learning_rate=5e-3), workers)
-        state, curve = train(t, t.start(), budget_s=None, max_steps=steps)
+        state, curve = train(t, t.start(), budget=Budget.start(None), max_steps=steps)
         # Far better than the best flat picture, and opaque where the ball is.
         photos = ball_photos()
         rendered = t.renderer(state)(rays_from_view(CAMERA, photos.posed.pose_of(0)))
@@ -195,7 +196,7 @@ def test_numbers_that_are_not_finite_are_a_collapse():
         t = training(SMALL_TINY, workers, max_flat_steps=3)
         tensors = t.to_tensors(t.start())
         tensors["parameters"][0] = np.inf
-        state, curve = train(t, t.from_tensors(tensors), budget_s=None, max_steps=4)
+        state, curve = train(t, t.from_tensors(tensors), budget=Budget.start(None), max_steps=4)
     assert state.attempt == 1
     assert [point.psnr for point in curve[:3]] == [0.0, 0.0, 0.0]
     assert curve[3].psnr > 0
@@ -242,4 +243,4 @@ def test_presets_are_those_of_the_course_and_the_paper():
 def test_impossible_options_are_refused(change):
     with pytest.raises(ValueError, match="got"):
         replace(TINY, **change)
-    assert isinstance(TINY, TrainOptions)
+    assert isinstance(TINY, NetworkOptions)

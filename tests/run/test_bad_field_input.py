@@ -9,9 +9,10 @@ from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.images.photos import write_photo
-from fieldstone.run import fast_fields
-from fieldstone.run.fast_fields import train_fast_run
+from fieldstone.run import grid_planning, grid_run
+from fieldstone.run.folder import RunFolder
 from grid_scenes import ball_photos
+from training import trained
 
 STEPS = {"finest": 24, "steps": [6] * 8, "num_chunks": 2, "samples_per_chunk": 256}
 
@@ -32,7 +33,7 @@ def write_scene(folder, *, edit=lambda pixels: pixels, poses=None):
 
 
 def train(folder, **options):
-    return train_fast_run(folder, folder / "out", plan=folder / "plan.json", threads=1, **options)
+    return trained(folder, folder / "out", plan=folder / "plan.json", threads=1, **options)
 
 
 def one_color(photos):
@@ -54,10 +55,11 @@ def several_sizes(photos):
 @pytest.mark.parametrize("edit", [one_color, mixed_alpha, some_missing, several_sizes])
 def test_odd_photos_still_make_a_field(tmp_path, edit):
     metrics = train(write_scene(tmp_path, edit=edit))
-    assert np.isfinite(metrics["psnr"])
+    assert metrics.psnr is not None
+    assert np.isfinite(metrics.psnr)
     if edit is one_color:
         # There is nothing to learn but one colour, and the background has it.
-        assert metrics["psnr"] > 25
+        assert metrics.psnr > 25
 
 
 def test_photos_of_one_pixel_are_refused(tmp_path):
@@ -72,7 +74,8 @@ def test_photos_without_a_common_place_are_refused_or_learned(tmp_path):
     pose = photos.posed.pose_of(0)
     poses = [Rigid3(pose.R, pose.t + [0.5 * k, 0.0, 0.0]) for k in range(10)]
     metrics = train(write_scene(tmp_path, edit=lambda photos: [pixels[..., :3] for pixels in photos], poses=poses))
-    assert np.isfinite(metrics["psnr"])
+    assert metrics.psnr is not None
+    assert np.isfinite(metrics.psnr)
 
 
 def test_cameras_at_one_place_are_refused(tmp_path):
@@ -84,32 +87,33 @@ def test_cameras_at_one_place_are_refused(tmp_path):
 
 def test_a_budget_of_a_second_makes_a_field(tmp_path):
     folder = write_scene(tmp_path)
-    metrics = train_fast_run(folder, folder / "out", budget_s=1.0, threads=1)
-    assert metrics["steps"] >= 1
+    metrics = trained(folder, folder / "out", budget_s=1.0, threads=1)
+    assert metrics.steps >= 1
     assert (folder / "out" / "checkpoint.safetensors").is_file()
     assert (folder / "out" / "preview.png").is_file()
 
 
 def test_too_little_memory_is_an_error(tmp_path):
     folder = write_scene(tmp_path)
-    with pytest.raises(InputError, match="--memory"):
-        train_fast_run(folder, folder / "out", budget_s=1.0, threads=1, memory_gib=1e-5)
+    with pytest.raises(InputError, match="`memory`"):
+        trained(folder, folder / "out", budget_s=1.0, threads=1, memory=1e-5)
 
 
 def test_less_memory_means_coarser_grids(tmp_path):
     folder = write_scene(tmp_path)
-    metrics = train_fast_run(folder, folder / "out", budget_s=1.0, threads=1, memory_gib=1e-3)
+    metrics = trained(folder, folder / "out", budget_s=1.0, threads=1, memory=1e-3)
     # 48 bytes a vertex.
-    assert 48 * metrics["plan"]["finest"] ** 3 < 2e-3 * 2**30
+    assert metrics.plan is not None
+    assert 48 * metrics.plan["finest"] ** 3 < 2e-3 * 2**30
 
 
 def test_a_full_disk_at_checkpoint_time_is_one_line(tmp_path, monkeypatch, capsys):
     folder = write_scene(tmp_path)
 
-    def full(path, tensors, header):
-        raise OSError(28, "No space left on device", str(path))
+    def full(folder, header, tensors):
+        raise OSError(28, "No space left on device", str(folder.checkpoint))
 
-    monkeypatch.setattr(fast_fields, "write_checkpoint", full)
+    monkeypatch.setattr(RunFolder, "write_checkpoint", full)
     arguments = ["train", str(folder), "-o", str(folder / "out"), "--plan", str(folder / "plan.json"), "--threads", "1"]
     assert main(arguments) == 5
     error = capsys.readouterr().err
@@ -121,8 +125,8 @@ def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
     def too_much(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr(fast_fields, "prepare_grid_training", too_much)
-    monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
+    monkeypatch.setattr(grid_planning, "prepare_grid_training", too_much)
+    monkeypatch.setattr(grid_run, "compile_kernels", lambda *arguments: None)
     folder = write_scene(tmp_path)
     assert main(["train", str(folder), "-o", str(folder / "out"), "--threads", "1"]) == 5
     error = capsys.readouterr().err
@@ -132,8 +136,10 @@ def test_too_little_memory_for_numpy_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_a_held_out_photo_of_another_size_is_found_before_training(tmp_path, monkeypatch):
     folder = write_scene(tmp_path)
-    monkeypatch.setattr(fast_fields, "prepare_grid_training", lambda *_, **__: pytest.fail("began to train"))
-    monkeypatch.setattr(fast_fields, "compile_kernels", lambda *arguments: None)
+    monkeypatch.setattr(
+        grid_planning, "prepare_grid_training", lambda *arguments, **options: pytest.fail("began to train")
+    )
+    monkeypatch.setattr(grid_run, "compile_kernels", lambda *arguments: None)
     scene = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps({**scene, "w": 40, "h": 32}))
     write_photo(folder / "r_8.png", np.zeros((50, 60, 4), np.uint8))

@@ -140,8 +140,9 @@ def test_every_photo_left_out_gets_a_verdict_with_a_number(photos):
     Image.fromarray(np.full((240, 320, 3), 90, dtype=np.uint8)).save(photos / "wall.png")
     shutil.copy(photos / "house_01.jpg", photos / "copy.jpg")
     options = ReconstructOptions(tuning=Tuning(sift=OPTIONS.sift), threads=2)
-    scene = reconstruct(photos, options)
-    verdicts = {photo.name: photo.verdict for photo in scene.record.photos if not photo.registered}
+    record = reconstruct(photos, options).record
+    assert record is not None
+    verdicts = {photo.name: photo.verdict for photo in record.photos if not photo.registered}
     assert set(verdicts) == {"house_03.jpg", "wall.png", "house_01.jpg"}
     assert re.search(r"\d+ features; \d+ % as sharp as the median photo", verdicts["house_03.jpg"])
     assert "0 features" in verdicts["wall.png"]

@@ -9,8 +9,9 @@ from fieldstone.errors import InputError
 from fieldstone.field.base.ray_dataset import NORMALIZED_RADIUS
 from fieldstone.geometry.rigid3 import look_at
 from fieldstone.io.images.photos import write_photo
+from fieldstone.io.posed.open import open_posed_scene
 from fieldstone.io.shapes.ply import write_points
-from fieldstone.run.field_input import frame_of, open_field_input, read_ray_dataset
+from fieldstone.run.field_input import frame_of, read_ray_dataset
 from fieldstone.scene.reconstruction import Points
 from grid_scenes import ball_photos
 
@@ -48,7 +49,7 @@ def test_other_photos_are_held_out_on_request(tmp_path, names, tested):
 
 def test_a_photo_to_hold_out_that_is_not_there_is_named(tmp_path):
     folder = write_transforms(tmp_path, alpha=True)
-    with pytest.raises(InputError, match=r"--hold-out r_9.*r_1\.png"):
+    with pytest.raises(InputError, match=r"`hold_out` r_9.*r_1\.png"):
         read_ray_dataset(folder, None, 100, hold_out=("r_3", "r_9"))
     with pytest.raises(InputError, match="held out"):
         read_ray_dataset(folder, None, 100, hold_out=tuple(f"r_{k}" for k in range(9)))
@@ -89,7 +90,7 @@ def test_points_of_a_file_give_the_range(tmp_path):
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     folder = write_transforms(tmp_path, alpha=False, ply_file_path="points.ply")
     write_points(Points(points, np.zeros((300, 3), dtype=np.uint8)), folder / "points.ply")
-    found = frame_of(open_field_input(folder), np.zeros(3))
+    found = frame_of(open_posed_scene(folder), np.zeros(3))
     assert found is not None
     frame, bounded = found
     assert not bounded
@@ -119,9 +120,9 @@ def test_llff_scenes_look_ahead(tmp_path):
 
 def test_other_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json"):
-        open_field_input(tmp_path)
+        open_posed_scene(tmp_path)
     with pytest.raises(InputError, match="no such"):
-        open_field_input(tmp_path / "nowhere")
+        open_posed_scene(tmp_path / "nowhere")
 
 
 def test_a_photo_that_cannot_be_read_is_left_out(tmp_path, caplog):

@@ -16,11 +16,18 @@ from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
 from fieldstone.run.field_input import read_ray_dataset, view_labels
-from fieldstone.run.fields import train_run
-from fieldstone.run.render import render_run
+from fieldstone.run.folder import RunFolder
+from fieldstone.run.render import render
 from fieldstone.scene.rays import rays_from_view
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
+from training import at_step
+from training import trained as trained_with
+
+
+def trained(source, out, **settings):
+    return trained_with(source, out, **{"field": "tiny", **settings})
+
 
 CAMERA = Camera("SIMPLE_PINHOLE", 20, 16, np.array([24.0, 10.0, 8.0]))
 
@@ -89,48 +96,50 @@ def test_train_on_a_blender_folder(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
     stages = []
-    metrics = train_run(source, out, budget_s=None, max_steps=160, threads=1, on_stage=stages.append)
-    assert metrics == json.loads((out / "metrics.json").read_text())
+
+    def hear(event):
+        if event.stage not in stages:
+            stages.append(event.stage)
+
+    metrics = trained(source, out, steps=160, threads=1, on_progress=hear)
+    assert metrics == RunFolder(out).read_metrics()
     assert stages == ["reading photos", "training", "rendering held-out views"]
-    assert set(metrics["views"]) == {"r_0", "r_1"}
-    assert metrics["steps"] == 160
-    assert "8-bit" in metrics["protocol"]
-    assert "2 held-out views of 20x16 pixels" in metrics["protocol"]
+    assert set(metrics.views) == {"r_0", "r_1"}
+    assert metrics.steps == 160
+    assert "8-bit" in metrics.protocol
+    assert "2 held-out views of 20x16 pixels" in metrics.protocol
     # The numbers are those of the written images against the photos on white.
-    for name, view in metrics["views"].items():
+    for name, view in metrics.views.items():
         rendered = read_photo(out / "renders" / "test" / f"{name}.png").rgb / 255.0
         given = read_photo(source / "test" / f"{name}.png")
         assert given.alpha is not None
         alpha = given.alpha[..., None] / 255.0
         photo = given.rgb / 255.0 * alpha + 1 - alpha
-        assert view["psnr"] == pytest.approx(psnr(rendered, photo), rel=1e-9)
-        assert view["ssim"] == pytest.approx(ssim(rendered, photo), rel=1e-9)
-    for key in ("psnr", "ssim"):
-        assert metrics[key] == pytest.approx(np.mean([view[key] for view in metrics["views"].values()]))
-    assert metrics["psnr"] > 16
+        assert view.psnr == pytest.approx(psnr(rendered, photo), rel=1e-9)
+        assert view.ssim == pytest.approx(ssim(rendered, photo), rel=1e-9)
+    assert metrics.psnr == pytest.approx(np.mean([view.psnr for view in metrics.views.values()]))
+    assert metrics.ssim == pytest.approx(np.mean([view.ssim for view in metrics.views.values()]))
+    assert metrics.psnr is not None
+    assert metrics.psnr > 16
     curve = json.loads((out / "curve.json").read_text())
     assert [point["step"] for point in curve] == list(range(1, 161))
     assert set(curve[0]) == {"step", "seconds", "loss", "psnr"}
     assert curve[-1]["psnr"] > curve[0]["psnr"]
-    assert metrics["seconds"] == curve[-1]["seconds"]
+    assert metrics.seconds == curve[-1]["seconds"]
 
 
 def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path):
     pytest.importorskip("torch")
     source = write_blender_folder(tmp_path / "in")
-    train_run(source, tmp_path / "whole", budget_s=None, max_steps=7, threads=1)
+    trained(source, tmp_path / "whole", steps=7, threads=1)
 
     class Killed(BaseException):
         pass
 
-    def kill_at_five(point):
-        if point.step == 5:
-            raise Killed
-
-    train_run(source, tmp_path / "parts", budget_s=None, max_steps=3, threads=2)
+    trained(source, tmp_path / "parts", steps=3, threads=2)
     with pytest.raises(Killed):
-        train_run(source, tmp_path / "parts", budget_s=None, max_steps=7, threads=1, on_step=kill_at_five)
-    train_run(source, tmp_path / "parts", budget_s=None, max_steps=7, threads=1)
+        trained(source, tmp_path / "parts", steps=7, threads=1, on_progress=at_step(5, Killed))
+    trained(source, tmp_path / "parts", steps=7, threads=1)
     name = "checkpoint.safetensors"
     assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     whole, parts = (json.loads((tmp_path / run / "curve.json").read_text()) for run in ("whole", "parts"))
@@ -141,12 +150,8 @@ def test_an_interrupted_run_keeps_its_steps(tmp_path):
     pytest.importorskip("torch")
     source = write_blender_folder(tmp_path / "in")
 
-    def interrupt_at_two(point):
-        if point.step == 2:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        train_run(source, tmp_path / "out", budget_s=None, max_steps=7, threads=1, on_step=interrupt_at_two)
+        trained(source, tmp_path / "out", steps=7, threads=1, on_progress=at_step(2, KeyboardInterrupt))
     tensors, _ = read_checkpoint(tmp_path / "out" / "checkpoint.safetensors")
     assert tensors["state.step"] == 2
 
@@ -154,52 +159,51 @@ def test_an_interrupted_run_keeps_its_steps(tmp_path):
 def test_the_budget_counts_earlier_runs(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
-    first = train_run(source, out, budget_s=0.2, threads=1)
-    assert first["seconds"] >= 0.2
-    again = train_run(source, out, budget_s=0.2, threads=1)
-    assert again["steps"] == first["steps"]
-    assert train_run(source, out, budget_s=first["seconds"] + 0.1, threads=1)["steps"] > first["steps"]
+    first = trained(source, out, budget_s=0.2, threads=1)
+    assert first.seconds >= 0.2
+    again = trained(source, out, budget_s=0.2, threads=1)
+    assert again.steps == first.steps
+    assert trained(source, out, budget_s=first.seconds + 0.1, threads=1).steps > first.steps
 
 
 def test_another_run_in_the_same_folder_is_refused(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
-    train_run(source, out, budget_s=None, max_steps=1, threads=1)
+    trained(source, out, steps=1, threads=1)
     with pytest.raises(InputError, match="differs in: seed"):
-        train_run(source, out, budget_s=None, max_steps=2, seed=1, threads=1)
+        trained(source, out, steps=2, seed=1, threads=1)
     photo = next((source / "train").iterdir())
     write_photo(photo, np.zeros((16, 20, 4), dtype=np.uint8))
     with pytest.raises(InputError, match="differs in: photos"):
-        train_run(source, out, budget_s=None, max_steps=2, threads=1)
+        trained(source, out, steps=2, threads=1)
 
 
 def test_damaged_checkpoints_are_refused_and_kept(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
-    train_run(source, out, budget_s=None, max_steps=2, threads=1)
+    trained(source, out, steps=2, threads=1)
     path = out / "checkpoint.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    for run in (lambda: train_run(source, out, budget_s=None, max_steps=3, threads=1), lambda: render_run(out)):
+    for run in (lambda: trained(source, out, steps=3, threads=1), lambda: render(out)):
         with pytest.raises(InputError, match="damaged or truncated checkpoint"):
             run()
     assert path.read_bytes() == whole[: len(whole) // 2]
     path.write_bytes(whole)
     (out / "curve.json").write_text("[{]")
     with pytest.raises(InputError, match=r"curve\.json"):
-        train_run(source, out, budget_s=None, max_steps=3, threads=1)
+        trained(source, out, steps=3, threads=1)
 
 
 def test_train_on_a_reconstruction(tmp_path):
     pytest.importorskip("torch")
     source = write_colmap_folder(tmp_path / "in", tmp_path / "photos")
-    (source / "run.json").write_text(json.dumps({"photos_folder": "../photos"}))
-    metrics = train_run(source, tmp_path / "out", budget_s=None, max_steps=2, threads=1)
+    metrics = trained(source, tmp_path / "out", steps=2, threads=1, photos=tmp_path / "photos")
     # Nine photos by name: numbers 0 and 8 are held out.
-    assert set(metrics["views"]) == {"p0", "p8"}
+    assert set(metrics.views) == {"p0", "p8"}
     tensors, _ = read_checkpoint(tmp_path / "out" / "checkpoint.safetensors")
     assert tensors["views.R"].shape == (7, 3, 3)
-    film = render_run(tmp_path / "out", path="through", fmt="gif", frames=3, threads=1)
+    film = render(tmp_path / "out", path="through", format="gif", frames=3, threads=1)
     assert film == tmp_path / "out" / "renders" / "through.gif"
 
 
@@ -233,39 +237,39 @@ def test_folders_without_posed_photos_are_refused(tmp_path):
 def test_render_formats(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
-    train_run(source, out, budget_s=None, max_steps=2, threads=1)
+    trained(source, out, steps=2, threads=1)
     done = []
-    film = render_run(out, frames=4, threads=1, on_frame=lambda k, n: done.append((k, n)))
+    film = render(out, frames=4, threads=1, on_progress=lambda event: done.append((event.done, event.total)))
     assert film.name == "orbit.mp4"
-    assert done == [(k, 4) for k in range(1, 5)]
-    folder = render_run(out, path="spiral", fmt="png", frames=2, size_px=40, threads=1)
+    assert done == [(k, 4) for k in range(5)]
+    folder = render(out, path="spiral", format="png", frames=2, size=40, threads=1)
     assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png"]
     assert read_photo(folder / "0000.png").rgb.shape == (32, 40, 3)
-    assert len(list(render_run(out, path="dataset", fmt="png", threads=1).iterdir())) == 6
+    assert len(list(render(out, path="dataset", format="png", threads=1).iterdir())) == 6
     given = tmp_path / "walk.json"
     given.write_text(json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}] * 2}))
-    assert render_run(out, path=str(given), fmt="gif", threads=1).name == "walk.gif"
-    shown = render_run(out, path=str(given), fmt="png", show="confidence", frames=5, threads=1)
+    assert render(out, path=str(given), format="gif", threads=1).name == "walk.gif"
+    shown = render(out, path=str(given), format="png", show="confidence", frames=5, threads=1)
     assert shown.name == "walk_confidence"
     assert len(list(shown.iterdir())) == 5
-    with pytest.raises(InputError, match="--path sideways: give one of orbit"):
-        render_run(out, path="sideways")
+    with pytest.raises(InputError, match="`path` sideways: give one of orbit"):
+        render(out, path="sideways")
     with pytest.raises(InputError, match="at least 1"):
-        render_run(out, frames=0)
+        render(out, frames=0)
     with pytest.raises(InputError, match="fieldstone train"):
-        render_run(tmp_path)
+        render(tmp_path)
 
 
 def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
     pytest.importorskip("torch")
     source, out = write_blender_folder(tmp_path / "in"), tmp_path / "out"
-    train_run(source, out, budget_s=None, max_steps=1, threads=1)
+    trained(source, out, steps=1, threads=1)
     path = out / "checkpoint.safetensors"
     tensors, header = read_checkpoint(path)
     del tensors["state.parameters"]
     write_checkpoint(path, tensors, header)
     with pytest.raises(InputError, match="parameters"):
-        render_run(out, frames=1, threads=1)
+        render(out, frames=1, threads=1)
 
 
 def test_without_torch_the_way_out_is_named(tmp_path, monkeypatch):
@@ -275,7 +279,7 @@ def test_without_torch_the_way_out_is_named(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.startswith(torch_users)]:
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(InputError, match=r"pip install 'fieldstone\[torch\]'"):
-        train_run(source, tmp_path / "out", max_steps=1)
+        trained(source, tmp_path / "out", steps=1)
     assert not (tmp_path / "out").exists()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from fieldstone.geometry.camera import image_from_cam
 from fieldstone.io.files.checkpoint import read_checkpoint
 from fieldstone.io.images.photos import read_photo, write_photo
 from fieldstone.io.models.colmap import write_colmap
-from fieldstone.run.fast_fields import train_fast_run
+from fieldstone.run.scene import open_scene
+from fieldstone.run.train import train
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
 from grid_scenes import CAMERA, RADIUS, ball_photos
+from training import trained
 
 WHITE_ROWS = 24
 
@@ -74,7 +77,7 @@ def test_nothing_is_learned_from_what_masks_hide(ball_model, tmp_path):
     for kind, masks in {"masked": Path("white"), "bare": None}.items():
         for folder in (ball_model, painted):
             out = tmp_path / kind / folder.name
-            train_fast_run(folder, out, plan=plan, threads=1, masks=masks and folder / masks, max_steps=30)
+            trained(folder, out, plan=plan, threads=1, masks=masks and folder / masks, steps=30)
     for kind, same in {"masked": True, "bare": False}.items():
         # The header names the folder; tensors are what was learned.
         one, other = (read_checkpoint(tmp_path / kind / name / "checkpoint.safetensors")[0] for name in names)
@@ -84,33 +87,32 @@ def test_nothing_is_learned_from_what_masks_hide(ball_model, tmp_path):
 
 def test_masks_are_kept_out_of_the_measures(ball_model, tmp_path):
     plan = write_plan(tmp_path / "plan.json")
-    metrics = train_fast_run(ball_model, tmp_path / "out", plan=plan, threads=1, masks=ball_model / "white")
-    assert "masks are white" in metrics["protocol"]
-    assert "exposure" in metrics["protocol"]
-    for label, view in metrics["views"].items():
+    metrics = trained(ball_model, tmp_path / "out", plan=plan, threads=1, masks=ball_model / "white")
+    assert "masks are white" in metrics.protocol
+    assert "exposure" in metrics.protocol
+    for label, view in metrics.views.items():
         rendered = read_photo(tmp_path / "out" / "renders" / "test" / f"{label}.png").rgb / 255.0
         photo = read_photo(ball_model / "images" / f"{label}.png").rgb / 255.0
-        assert view["psnr"] == pytest.approx(psnr(rendered[:WHITE_ROWS], photo[:WHITE_ROWS]), abs=1e-4)
+        assert view.psnr == pytest.approx(psnr(rendered[:WHITE_ROWS], photo[:WHITE_ROWS]), abs=1e-4)
 
 
 def test_the_masks_of_a_reconstruction_are_found_by_themselves(ball_model, tmp_path):
     plan = write_plan(tmp_path / "plan.json")
-    given = train_fast_run(ball_model, tmp_path / "a", plan=plan, threads=1, masks=ball_model / "white")
-    (ball_model / "run.json").write_text(json.dumps({"masks_folder": "white"}))
-    try:
-        found = train_fast_run(ball_model, tmp_path / "b", plan=plan, threads=2)
-    finally:
-        (ball_model / "run.json").unlink()
-    assert found["views"] == given["views"]
+    given = trained(ball_model, tmp_path / "a", plan=plan, threads=1, masks=ball_model / "white")
+    scene = open_scene(ball_model)
+    assert scene.masks_folder is None
+    found = train(replace(scene, masks_folder=ball_model / "white"), keep_in=tmp_path / "b", plan=plan, threads=2)
+    assert found.metrics is not None
+    assert found.metrics.views == given.views
     a, b = ((tmp_path / name / "checkpoint.safetensors").read_bytes() for name in "ab")
     assert a == b
 
 
 def test_a_stop_does_not_change_a_byte(ball_model, tmp_path):
     plan = write_plan(tmp_path / "plan.json")
-    train_fast_run(ball_model, tmp_path / "a", plan=plan, threads=1)
-    train_fast_run(ball_model, tmp_path / "b", plan=plan, threads=2, max_steps=55)
-    train_fast_run(ball_model, tmp_path / "b", plan=plan, threads=2)
+    trained(ball_model, tmp_path / "a", plan=plan, threads=1)
+    trained(ball_model, tmp_path / "b", plan=plan, threads=2, steps=55)
+    trained(ball_model, tmp_path / "b", plan=plan, threads=2)
     a, b = ((tmp_path / name / "checkpoint.safetensors").read_bytes() for name in "ab")
     assert a == b
 
@@ -132,4 +134,4 @@ def test_masks_of_another_size_are_refused(ball_model, tmp_path):
     for k in range(9):
         write_photo(tmp_path / "masks" / f"r_{k}.png", np.full((8, 8, 3), 255, dtype=np.uint8))
     with pytest.raises(InputError, match="size of its photo"):
-        train_fast_run(ball_model, tmp_path / "out", threads=1, masks=tmp_path / "masks")
+        trained(ball_model, tmp_path / "out", threads=1, masks=tmp_path / "masks")

@@ -7,6 +7,7 @@ import pytest
 
 from fieldstone.run.reconstruct import reconstruct
 from fieldstone.run.scene import Scene
+from fieldstone.scene.mapping_run import MappingRun
 
 REDUCTION = 2.0
 
@@ -17,30 +18,36 @@ def scene(house_photos) -> Scene:
     return reconstruct(house_photos, max_image_size=round(320 / REDUCTION), covariance=True)
 
 
+@pytest.fixture(scope="module")
+def run(scene) -> MappingRun:
+    """The story of the scene."""
+    return scene.mapped.run
+
+
 def test_notes_give_the_intrinsics_of_the_photos(scene):
-    camera = scene.run.reconstruction.cameras[0]
+    camera = scene.model.cameras[0]
     assert (camera.width, camera.height) == (320, 240)
     assert abs(camera.principal_point[0] - 160) < 20
-    (note,) = [note for note in scene.record.notes if note.startswith("camera ")]
+    (note,) = [note for note in scene.notes if note.startswith("camera ")]
     told = [float(number) for number in re.findall(r"-?[\d.]+(?:e-?\d+)?(?=,|$)", note.partition(":")[2])]
     np.testing.assert_allclose(told, camera.params, rtol=1e-5)
 
 
-def test_errors_are_in_pixels_of_the_photos(scene):
+def test_errors_are_in_pixels_of_the_photos(scene, run):
     """The predictions are as far off as the reprojections; sigma^2 is their squared sum over the degrees of freedom."""
-    errors = scene.run.reconstruction.reprojection_errors()
+    errors = scene.model.reprojection_errors()
     rms = float(np.sqrt(np.mean(errors**2)))
-    after = np.concatenate([r.errors() for r in scene.run.records if r.stage == "after BA"])
+    after = np.concatenate([r.errors() for r in run.records if r.stage == "after BA"])
     assert float(np.sqrt(np.mean(after**2))) == pytest.approx(rms, rel=1e-9)
-    assert scene.run.uncertainty is not None
-    model = scene.run.reconstruction
+    assert run.uncertainty is not None
+    model = scene.model
     camera_freedoms = 4
     freedoms = 2 * len(errors) - 6 * len(model.registered()) - 3 * len(model.points) - camera_freedoms + 7
     expected = np.sqrt(np.sum(errors**2) / freedoms)
-    assert scene.run.uncertainty.sigma_px == pytest.approx(expected, rel=0.01)
+    assert run.uncertainty.sigma_px == pytest.approx(expected, rel=0.01)
 
 
-def test_thresholds_grow_with_the_reduction(scene):
-    errors = scene.run.reconstruction.reprojection_errors()
+def test_thresholds_grow_with_the_reduction(scene, run):
+    errors = scene.model.reprojection_errors()
     assert 4.0 < errors.max() <= 4.0 * REDUCTION
-    assert all(f"{4 * REDUCTION:g} px" in drop.reason for drop in scene.run.drops if "reprojection" in drop.reason)
+    assert all(f"{4 * REDUCTION:g} px" in drop.reason for drop in run.drops if "reprojection" in drop.reason)

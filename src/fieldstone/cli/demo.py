@@ -21,11 +21,13 @@ def demo(out: Out = Path("fieldstone-demo"), *, options: tyro.conf.OmitArgPrefix
 
     console = plain_console()
     with shown_progress(console) as on_progress:
-        record, metrics = run_demo(out, options, on_progress=on_progress)
+        made = run_demo(out, options, on_progress=on_progress)
+    record = made.scene.record
+    assert record is not None
     show_run(console, record, out)
-    truth = record.truth
-    if truth is None or metrics is None:
+    if made.field is None or made.field.metrics is None or record.truth is None:
         return 4
+    truth, metrics = record.truth, made.field.metrics
     console.print(
         f"against the truth: rotation off by {truth.rotation_error_mean_deg:.3f} deg, position by "
         f"{1000 * truth.position_error_mean_m:.1f} mm on average; held-out views: PSNR {metrics.psnr:.2f} dB, "

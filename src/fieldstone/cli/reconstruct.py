@@ -23,5 +23,6 @@ def reconstruct(source: Source, /, out: Out, options: tyro.conf.OmitArgPrefixes[
     console = plain_console()
     with shown_progress(console) as on_progress:
         scene = run(source, options, keep_in=out, on_progress=on_progress)
+    assert scene.record is not None
     show_run(console, scene.record, out)
     return 0 if scene.summary.registered >= 2 else 4

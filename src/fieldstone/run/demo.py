@@ -2,60 +2,68 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fieldstone.progress import OnProgress, Progress, silent
-from fieldstone.records.field import FieldMetrics
-from fieldstone.records.files import from_json
-from fieldstone.records.mapping import RunRecord, TruthErrors
-from fieldstone.run.fast_fields import train_fast_run
+from fieldstone.records.mapping import TruthErrors
+from fieldstone.run.field import Field
 from fieldstone.run.folder import RunFolder
-from fieldstone.run.options import DemoOptions, workers
-from fieldstone.run.reconstruct import reconstruct
+from fieldstone.run.options import DemoOptions, TrainOptions, workers
+from fieldstone.run.reconstruct import reconstructed
 from fieldstone.run.reconstruct_options import ReconstructOptions
+from fieldstone.run.scene import Scene, write_scene
+from fieldstone.run.train import train_into
 from fieldstone.scene.alignment import align
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.synthetic.photos import PhotoOptions, make_photos, write_photos
 
 
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """What the road led to, and what it misses the truth by."""
+
+    scene: Scene
+    field: Field | None
+    """None without a model."""
+
+
 def run_demo(
-    out: Path,
-    options: DemoOptions,
+    out: str | Path,
+    options: DemoOptions | None = None,
     *,
     photo_options: PhotoOptions | None = None,
     on_progress: OnProgress = silent,
-) -> tuple[RunRecord, FieldMetrics | None]:
+) -> Demo:
     """Photograph a synthetic house, reconstruct it, train a field on it, and compare with the truth.
 
     Everything goes to `out`: `photos/`, what `reconstruct` writes, what `train` writes, one report.
 
-    Returns:
-        What `run.json` and `metrics.json` hold; no metrics without a model.
+    Raises:
+        InputError: Another process writes to `out`, or it cannot be written.
     """
-    photo_options = photo_options or PhotoOptions()
-    threads = workers(options.threads)
-    on_progress(Progress("photographing a house"))
-    photos = make_photos(photo_options, np.random.default_rng(options.seed), threads=threads)
-    write_photos(photos, out / "photos", photo_options)
-    settings = ReconstructOptions(threads=options.threads, seed=options.seed)
-    scene = reconstruct(out / "photos", settings, keep_in=out, on_progress=on_progress)
-    record = scene.record
-    if not scene.summary.registered:
-        return record, None
-    record = replace(record, truth=errors_against_truth(scene.model, photos.truth))
-    RunFolder(out).write_run(record)
-    metrics = train_fast_run(
-        out,
-        out,
-        budget_s=options.budget_s or 60.0,
-        seed=options.seed,
-        threads=threads,
-        on_stage=lambda stage: on_progress(Progress(stage)),
-    )
-    return record, from_json(FieldMetrics, metrics, "metrics")
+    options, photo_options = options or DemoOptions(), photo_options or PhotoOptions()
+    folder = RunFolder(Path(out))
+    with folder.sole_writer() as cache:
+        on_progress(Progress("photographing a house"))
+        rng = np.random.default_rng(options.seed)
+        photos = make_photos(photo_options, rng, threads=workers(options.threads))
+        write_photos(photos, folder.photos, photo_options)
+        reconstruct_options = ReconstructOptions(threads=options.threads, seed=options.seed)
+        scene = reconstructed(folder.photos, reconstruct_options, cache, on_progress)
+        if not scene.summary.registered:
+            return Demo(write_scene(scene, folder), None)
+        scene = write_scene(with_truth(scene, photos.truth), folder)
+        train_options = TrainOptions(budget_s=options.budget_s, threads=options.threads, seed=options.seed)
+        return Demo(scene, train_into(folder, scene, train_options, on_progress=on_progress))
+
+
+def with_truth(scene: Scene, truth: Reconstruction) -> Scene:
+    """The scene with what its model misses the truth by."""
+    assert scene.record is not None
+    return replace(scene, record=replace(scene.record, truth=errors_against_truth(scene.model, truth)))
 
 
 def errors_against_truth(model: Reconstruction, truth: Reconstruction) -> TruthErrors:

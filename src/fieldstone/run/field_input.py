@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +30,7 @@ from fieldstone.io.images.masks import find_masks, read_mask
 from fieldstone.io.images.photos import read_photo, read_photo_info
 from fieldstone.io.posed.open import open_posed_scene
 from fieldstone.io.posed.posed_scene import PosedScene
-from fieldstone.render.camera_paths import focus_point
+from fieldstone.rendering.camera_paths import focus_point
 from fieldstone.scene.photos import DecodedPhotos, PosedPhotos
 
 logger = logging.getLogger(__name__)
@@ -57,7 +56,7 @@ class Split:
 def read_ray_dataset(
     source: Path, photos: Path | None, image_size_px: int, *, hold_out: Sequence[str] | None = None
 ) -> RayDataset:
-    """The dataset of a folder with posed photos; see `open_field_input`.
+    """The dataset of a folder with posed photos; see `open_posed_scene`.
 
     Args:
         photos: Folder with the photos of a COLMAP model; None: `images` beside the model, where the reconstruction
@@ -68,13 +67,8 @@ def read_ray_dataset(
     Raises:
         InputError: No posed photos, photos missing, or nothing to train on.
     """
-    scene = open_field_input(source, photos)
+    scene = open_posed_scene(source, photos)
     return dataset_of(scene, holding_out(scene, hold_out), image_size_px)
-
-
-def open_field_input(source: Path, photos: Path | None = None) -> PosedScene:
-    """What `open_posed_scene` finds in a source; a reconstruction of ours says itself where its photos were."""
-    return open_posed_scene(source, photos, taken_from=_recorded(source, "photos_folder"))
 
 
 def dataset_of(scene: PosedScene, split: Split, image_size_px: int, *, held_out: bool = True) -> RayDataset:
@@ -125,24 +119,17 @@ def holding_out(scene: PosedScene, names: Sequence[str] | None) -> Split:
     for name in names:
         if not any(name in of_photo for of_photo in known):
             some = ", ".join(paths[i].name for i in rows[:5].tolist())
-            raise InputError(f"--hold-out {name}: no such photo among {len(rows)} ({some}, ...)")
+            raise InputError(f"`hold_out` {name}: no such photo among {len(rows)} ({some}, ...)")
     held_out = np.array([not of_photo.isdisjoint(names) for of_photo in known], dtype=bool)
     return Split(rows[~held_out], rows[held_out])
 
 
-def with_masks(scene: PosedScene, split: Split, masks: Path | None, source: Path) -> PosedScene:
+def with_masks(scene: PosedScene, split: Split, masks: Path) -> PosedScene:
     """The scene with the masks of a folder for the photos of a split, see `io.images.masks.find_masks`.
-
-    Args:
-        masks: None: those that the reconstruction in `source` was made with, or those that the scene names.
 
     Raises:
         InputError: No such folder, no mask for any photo, or a mask of another size than its photo.
     """
-    if masks is None and (named := _recorded(source, "masks_folder")) is not None and named.is_dir():
-        masks = named
-    if masks is None:
-        return scene
     paths = _paths(scene.photos)
     found = find_masks(masks, [paths[i] for i in np.concatenate([split.train, split.test]).tolist()])
     return replace(scene, photos=replace(scene.photos, masks=tuple(found.get(path) for path in paths)))
@@ -276,12 +263,3 @@ def _frame_from_cameras(photos: DecodedPhotos, background: Float[np.ndarray, "3"
         raise InputError("all cameras stand at one place: nothing says how far the scene is; give points or a box")
     frame = frame_around(middle, radius, distances, background)
     return (frame if bounded else replace(frame, near=0.1 * frame.far)), bounded
-
-
-def _recorded(source: Path, name: str) -> Path | None:
-    """A folder that the run.json of a reconstruction names, relative to it."""
-    try:
-        return source / str(json.loads((source / "run.json").read_text())[name])
-    except (OSError, ValueError, KeyError, TypeError):
-        logger.debug("%s: no run.json that names %s", source, name)
-        return None

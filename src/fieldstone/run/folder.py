@@ -149,6 +149,10 @@ class RunFolder:
         """A path as seen from this folder, so that both may move together."""
         return Path(os.path.relpath(path.resolve(), self.path.resolve())).as_posix()
 
+    def recorded(self, relative: str | None) -> Path | None:
+        """The path that `relative` made a text of; None for None."""
+        return None if relative is None else (self.path / relative).resolve()
+
     def write_models(self, models: Sequence[Reconstruction]) -> None:
         """`sparse/0`, `sparse/1`, ... and the points of the first; further models of an earlier run go.
 

@@ -163,7 +163,7 @@ class TrainOptions:
     @property
     def seconds(self) -> float:
         """The budget, as given or as the quality says."""
-        return QUALITY_S[self.quality] if self.budget_s is None else self.budget_s
+        return QUALITY_S[self.quality] if self.budget_s is None else float(self.budget_s)
 
 
 @dataclass(frozen=True)

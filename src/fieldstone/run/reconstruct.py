@@ -13,6 +13,7 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.io.course.matching_txt import is_course_folder
 from fieldstone.io.files.cache import Workspace
+from fieldstone.io.posed.model_photos import photos_of_model
 from fieldstone.progress import OnProgress, Progress, silent
 from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
 from fieldstone.report.figures import shrunk, thumbnails
@@ -21,7 +22,7 @@ from fieldstone.run.map_photos import ChosenMapper, map_given_matches, map_photo
 from fieldstone.run.mapper_checkpoint import MapperCheckpoints
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_course
 from fieldstone.run.reconstruct_options import ReconstructOptions
-from fieldstone.run.scene import Scene, sizes_of, summary_of, write_scene
+from fieldstone.run.scene import Mapped, Scene, sizes_of, summary_of, write_scene
 from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.reconstruction import View
 
@@ -64,7 +65,7 @@ def reconstruct(
     """
     options = options or ReconstructOptions(**settings)
     if keep_in is None:
-        return _reconstructed(Path(source), options, Workspace(), on_progress)
+        return reconstructed(Path(source), options, Workspace(), on_progress)
     out = RunFolder(Path(keep_in))
     with out.sole_writer(fresh=options.fresh) as cache:
         return reconstruct_into(out, cache, Path(source), options, report=report, on_progress=on_progress)
@@ -87,23 +88,24 @@ def reconstruct_into(
             if report:
                 small.append(meanwhile.submit(thumbnails, photos.graph.names, shrunk(photos.photo_of)))
 
-        scene = _reconstructed(source, options, cache, on_progress, draw_thumbnails)
+        scene = reconstructed(source, options, cache, on_progress, draw_thumbnails)
     on_progress(Progress("writing"))
     scene = write_scene(scene, out, report=report, small=small[0].result() if small else None)
     MapperCheckpoints(cache).forget()
     return scene
 
 
-def _reconstructed(
+def reconstructed(
     source: Path,
     options: ReconstructOptions,
     cache: Workspace,
     on_progress: OnProgress,
     on_matched: Callable[[MatchedPhotos], None] = lambda photos: None,
 ) -> Scene:
-    """The stages, one after the other.
+    """`reconstruct` without a folder: the stages, one after the other.
 
     Args:
+        cache: Keeps what the stages find, and has what earlier runs have found.
         on_matched: Is called with the matched photos before they are mapped.
     """
     given = is_course_folder(source)
@@ -115,7 +117,8 @@ def _reconstructed(
     mapper, run = run_mapper(photos, options, MapperCheckpoints(cache), on_progress, given=given)
     seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
     record = run_record(source, mapper, run, photos, options.seed, seconds)
-    return Scene(record, run, photos.photo_of, source, options.masks)
+    posed = photos_of_model(run.reconstruction, source)
+    return Scene(posed, record, Mapped(run, photos.photo_of, source), options.masks)
 
 
 def run_mapper(

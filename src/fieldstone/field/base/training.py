@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from fieldstone.field.base.budget import Budget
 from fieldstone.field.base.interrupts import deferred_interrupts
 from fieldstone.field.base.radiance_field import FieldTraining, StepReport
 from fieldstone.records.field import CurvePoint
@@ -18,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class TrainOptions:
+class NetworkOptions:
     """How a network is built, sampled and trained; `TINY` and `NERF` are the two settings that people know."""
 
     network: Literal["tiny", "nerf"]
@@ -55,7 +56,7 @@ class TrainOptions:
         return self.learning_rate * (self.final_learning_rate / self.learning_rate) ** share
 
 
-TINY = TrainOptions(
+TINY = NetworkOptions(
     network="tiny",
     width=128,
     position_frequencies=6,
@@ -71,7 +72,7 @@ TINY = TrainOptions(
 )
 """The small network of the course: 100x100 photos, one whole photo per step, 32 samples, loss log(MSE)."""
 
-NERF = TrainOptions(
+NERF = NetworkOptions(
     network="nerf",
     width=256,
     position_frequencies=10,
@@ -99,7 +100,7 @@ def train(
     training: FieldTraining[S],
     state: S,
     *,
-    budget_s: float | None,
+    budget: Budget,
     max_steps: int | None = None,
     curve: tuple[CurvePoint, ...] = (),
     on_step: OnStep = lambda point: None,
@@ -115,7 +116,7 @@ def train(
 
     Args:
         state: Where to start; after a stop, what the checkpoint holds.
-        budget_s: Seconds of training in all, those of `curve` included; None: no limit.
+        budget: Training ends when it is over, but not before one step was done in all.
         max_steps: Steps in all, those of `curve` included; None: no limit.
         curve: The steps done before.
         show: Is called now and then, for a picture of what there is.
@@ -127,7 +128,7 @@ def train(
     Raises:
         ValueError: Neither a budget nor a number of steps.
     """
-    if budget_s is None and max_steps is None:
+    if not budget.is_limited and max_steps is None:
         raise ValueError("training needs a budget in seconds or a number of steps")
     points = list(curve)
     before = points[-1].seconds if points else 0.0
@@ -135,9 +136,7 @@ def train(
     paused = 0.0
     with deferred_interrupts() as check:
         try:
-            while (max_steps is None or len(points) < max_steps) and (
-                budget_s is None or not points or points[-1].seconds < budget_s
-            ):
+            while (max_steps is None or len(points) < max_steps) and (not points or budget.left() > 0):
                 state, report = training.advance(state)
                 now = time.perf_counter()
                 points.append(_curve_point(len(points) + 1, before + now - start - paused, report))

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from fieldstone.field.base.radiance_field import FieldFrame
-from fieldstone.field.base.training import TrainOptions
+from fieldstone.field.base.training import NetworkOptions
 from fieldstone.field.nerf.encodings import encoded_size
 from fieldstone.field.nerf.rendering import Composite, composite, frequency_encoding, hierarchical, stratified
 
@@ -30,7 +30,7 @@ SKIP_AFTER = 5
 """The encoded position goes in again beside the output of this layer of the nerf network."""
 
 
-def layer_sizes(options: TrainOptions) -> dict[str, tuple[int, int]]:
+def layer_sizes(options: NetworkOptions) -> dict[str, tuple[int, int]]:
     """(inputs, outputs) of every layer of one network, by name, in the order of the flat vector."""
     width = options.width
     position, direction = encoded_size(options.position_frequencies), encoded_size(options.direction_frequencies)
@@ -47,12 +47,12 @@ def layer_sizes(options: TrainOptions) -> dict[str, tuple[int, int]]:
     }
 
 
-def network_size(options: TrainOptions) -> int:
+def network_size(options: NetworkOptions) -> int:
     """Number of parameters of one network."""
     return sum((n_in + 1) * n_out for n_in, n_out in layer_sizes(options).values())
 
 
-def initial_parameters(options: TrainOptions, rng: np.random.Generator) -> Float[np.ndarray, "p"]:
+def initial_parameters(options: NetworkOptions, rng: np.random.Generator) -> Float[np.ndarray, "p"]:
     """Random weights and biases; float32.
 
     tiny: both uniform in +-1 / sqrt(inputs), which is what torch, and so the course, starts from. (From weights 1.7
@@ -72,7 +72,7 @@ def initial_parameters(options: TrainOptions, rng: np.random.Generator) -> Float
     return np.concatenate(parts).astype(np.float32)
 
 
-def split_parameters(options: TrainOptions, flat: Float[Tensor, "p"]) -> dict[str, Tensor]:
+def split_parameters(options: NetworkOptions, flat: Float[Tensor, "p"]) -> dict[str, Tensor]:
     """Views of the flat vector: for each layer `name.weight` (inputs, outputs) and `name.bias` (outputs,)."""
     out: dict[str, Tensor] = {}
     start = 0
@@ -85,7 +85,7 @@ def split_parameters(options: TrainOptions, flat: Float[Tensor, "p"]) -> dict[st
 
 
 def density_and_color(
-    options: TrainOptions,
+    options: NetworkOptions,
     parameters: Mapping[str, Tensor],
     encoded_positions: Float[Tensor, "r s k"],
     encoded_directions: Float[Tensor, "r d"],
@@ -103,7 +103,7 @@ def density_and_color(
 
 
 def render_rays(
-    options: TrainOptions,
+    options: NetworkOptions,
     frame: FieldFrame,
     networks: Sequence[Mapping[str, Tensor]],
     origins: Float[Tensor, "r 3"],

@@ -22,7 +22,7 @@ from torch import Tensor
 from fieldstone.errors import InputError
 from fieldstone.field.base.radiance_field import FieldFrame, RayRenderer, RenderedRays, StepReport
 from fieldstone.field.base.ray_dataset import TrainingRays
-from fieldstone.field.base.training import TrainOptions
+from fieldstone.field.base.training import NetworkOptions
 from fieldstone.field.nerf.adam import adam
 from fieldstone.field.nerf.networks import initial_parameters, network_size, render_rays, split_parameters
 from fieldstone.scene.rays import Rays
@@ -85,7 +85,7 @@ def torch_device(name: str) -> torch.device:
 class TorchTraining:
     """`FieldTraining` of the networks. `rays` may be None where a field is only rendered."""
 
-    options: TrainOptions
+    options: NetworkOptions
     frame: FieldFrame
     rays: TrainingRays | None
     seed: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import re
@@ -196,6 +197,19 @@ def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 9
     """Write RGB or RGBA pixels, format by suffix, whole or not at all; `quality` is for JPEG and WebP."""
     with replacing(path) as temporary:
         Image.fromarray(rgb).save(temporary, quality=quality)
+
+
+def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
+    """RGB or RGBA pixels as a PNG file in memory."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def pixels_of_png(data: bytes) -> UInt8[np.ndarray, "h w c"]:
+    """The pixels of `png_bytes`."""
+    with Image.open(io.BytesIO(data)) as image:
+        return np.asarray(image)
 
 
 def turned_upright(pixels: UInt8[np.ndarray, "h w"], orientation: int) -> UInt8[np.ndarray, "_ _"]:

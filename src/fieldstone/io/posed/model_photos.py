@@ -30,6 +30,16 @@ def read_model_photos(source: Path, photos: Path | None = None, *, taken_from: P
     """
     model = read_colmap(source)
     folder = photos or _photo_folder(source, model, taken_from)
+    scene = photos_of_model(model, folder)
+    if scene is None:
+        raise InputError(
+            f"{folder}: holds none of the {len(model.registered())} photos of the model; give their folder as `photos`"
+        )
+    return scene
+
+
+def photos_of_model(model: Reconstruction, folder: Path) -> PosedScene | None:
+    """The registered views of a model whose photos lie in a folder; None if there are none."""
     registered = model.registered().tolist()
     is_there = {i: (folder / model.views[i].name).is_file() for i in registered}
     problems = tuple(
@@ -39,9 +49,7 @@ def read_model_photos(source: Path, photos: Path | None = None, *, taken_from: P
         logger.warning("skipped %s: %s", problem.path, problem.reason)
     found = [i for i, there in is_there.items() if there]
     if not found:
-        raise InputError(
-            f"{folder}: holds none of the {len(registered)} photos of the model; give their folder as `photos`"
-        )
+        return None
     names = [model.views[i].name for i in found]
     table = posed_photos(
         names,

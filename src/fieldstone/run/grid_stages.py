@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from fieldstone.field.base.budget import Budget
 from fieldstone.field.base.interrupts import deferred_interrupts
 from fieldstone.field.base.radiance_field import FieldTraining
 from fieldstone.field.base.training import CurvePoint, OnStep, train
@@ -56,7 +57,7 @@ def train_stages(
     state: P,
     curve: tuple[CurvePoint, ...],
     *,
-    deadline: float | None,
+    budget: Budget | None,
     max_steps: int | None,
     on_step: OnStep,
     save: Callable[[P, tuple[CurvePoint, ...]], None],
@@ -65,8 +66,8 @@ def train_stages(
     """Follow the plan of a state to its end, stage by stage.
 
     Args:
-        deadline: At the start of each stage, the steps to come are set to what fits until this time of
-            `time.perf_counter`, and there training ends; None: the plan stands.
+        budget: At the start of each stage, the steps to come are set to what fits into it, and training ends with it;
+            None: the plan stands.
     """
     saved = time.perf_counter()
 
@@ -83,19 +84,25 @@ def train_stages(
             end = sum(schedule.steps[: stage + 1])
             last = min(end, schedule.total_steps, max_steps or end)
             before, began = state.step, time.perf_counter()
-            left = None if deadline is None else deadline - began + (curve[-1].seconds if curve else 0.0)
             state, curve = train(
-                training, state, budget_s=left, max_steps=last, curve=curve, on_step=on_step, save=keep,
-                save_at_end=False, show=preview,
-            )  # fmt: skip
+                training,
+                state,
+                budget=budget or Budget.start(None),
+                max_steps=last,
+                curve=curve,
+                on_step=on_step,
+                save=keep,
+                save_at_end=False,
+                show=preview,
+            )
             now = time.perf_counter()
             if state.step < last:
                 state = state.with_plan(state.plan.replaced(stop_after=state.step))
                 logger.warning("the time is over after %d of %d steps", state.step, sum(schedule.steps))
-            elif deadline is not None and stage + 1 < len(schedule.steps) and last == end:
+            elif budget is not None and stage + 1 < len(schedule.steps) and last == end:
                 slower = 1.4 if schedule.levels(stage + 1) != schedule.levels(stage) else 1.0
                 per_step = slower * (now - began) / (state.step - before)
-                state = state.with_plan(corrected(plan, stage + 1, deadline - now, per_step))
+                state = state.with_plan(corrected(plan, stage + 1, budget.left(), per_step))
                 took = now - began
                 logger.info(
                     "stage %d: %d steps in %.1f s; plan %s", stage, state.step - before, took, state.plan.schedule.steps

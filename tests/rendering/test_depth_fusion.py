@@ -5,8 +5,8 @@ import pytest
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import look_at
-from fieldstone.render.depth_fusion import REACH, fused
-from fieldstone.render.meshing import cleaned
+from fieldstone.rendering.depth_fusion import REACH, fused
+from fieldstone.rendering.meshing import cleaned
 from fieldstone.scene.rays import rays_from_view
 
 CAMERA = Camera("SIMPLE_PINHOLE", 200, 160, np.array([230.0, 100.0, 80.0]))

@@ -4,8 +4,8 @@ from fieldstone.field.base.radiance_field import RenderedRays, surface_depth
 from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.render import views
-from fieldstone.render.views import (
+from fieldstone.rendering import views
+from fieldstone.rendering.views import (
     RenderedView,
     confidence_image,
     depth_image,

@@ -3,7 +3,7 @@ import pytest
 
 from fieldstone.geometry import rotation
 from fieldstone.geometry.rigid3 import Rigid3, look_at
-from fieldstone.render.camera_paths import focus_point, orbit, spiral, through, up_direction
+from fieldstone.rendering.camera_paths import focus_point, orbit, spiral, through, up_direction
 from matchers import assert_rigid3_near
 
 FOCUS = np.array([0.5, -1.0, 2.0])

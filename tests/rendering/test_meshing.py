@@ -6,8 +6,8 @@ import pytest
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import look_at
-from fieldstone.render.meshing import cleaned, colored, solidity, surface
-from fieldstone.render.rasterize_numba import mesh_depth
+from fieldstone.rendering.meshing import cleaned, colored, solidity, surface
+from fieldstone.rendering.rasterize_numba import mesh_depth
 from fieldstone.scene.mesh import Mesh
 from fieldstone.scene.rays import rays_from_view
 

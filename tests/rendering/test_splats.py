@@ -6,9 +6,9 @@ import pytest
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
 from fieldstone.geometry.rotation import random_rotation
-from fieldstone.render.meshing import surface
-from fieldstone.render.splat_view_numba import DILATION, splat_view
-from fieldstone.render.splatting import splats_of_surface
+from fieldstone.rendering.meshing import surface
+from fieldstone.rendering.splat_view_numba import DILATION, splat_view
+from fieldstone.rendering.splatting import splats_of_surface
 from fieldstone.scene.splats import NUM_SH, SH_C0, Splats, sh_basis, splat_colors
 
 CAMERA = Camera("SIMPLE_PINHOLE", 41, 41, np.array([50.0, 20.5, 20.5]))
