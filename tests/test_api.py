@@ -72,6 +72,8 @@ def test_a_scene_tells_of_every_photo_and_leaves_no_file(scene, photos):
     assert all(verdict.startswith("registered: ") for verdict in scene.verdicts.values())
     assert scene.graph is not None
     assert scene.graph.names == tuple(sorted(scene.verdicts))
+    tried = [note.split()[1] for note in scene.notes if note.startswith("calibration ")]
+    assert tried == [trial.model for trial in scene.calibration]
     errors = scene.model.reprojection_errors()
     assert scene.summary.mean_px == pytest.approx(float(errors.mean()))
     assert {path.suffix for path in photos.iterdir()} == {".jpg"}

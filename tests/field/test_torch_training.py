@@ -222,7 +222,7 @@ def test_checkpoints_of_another_network_are_refused():
 
 
 def test_unknown_devices_are_refused():
-    with pytest.raises(InputError, match="--device cpu"):
+    with pytest.raises(InputError, match="`device` cpu"):
         torch_device("abacus")
 
 

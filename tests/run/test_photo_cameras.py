@@ -54,5 +54,5 @@ def test_photos_share_a_camera_unless_it_was_turned():
 
 def test_intrinsics_that_do_not_fit_the_model_are_refused():
     options = replace(MatchingOptions(), camera_model="OPENCV", intrinsics=(1.0, 2.0, 3.0))
-    with pytest.raises(InputError, match=r"--intrinsics 1\.0,2\.0,3\.0"):
+    with pytest.raises(InputError, match=r"`intrinsics` 1\.0,2\.0,3\.0"):
         cameras_of_photos([info_of(1)], options)

@@ -37,6 +37,7 @@ from fieldstone.mapping.model.working_model import WorkingModel, record_views, t
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, select_camera_models
 from fieldstone.mapping.textbook import four_poses
 from fieldstone.progress import OnProgress, StageProgress, silent
+from fieldstone.records.mapping import CameraTrial
 from fieldstone.scene.mapping_run import Drop, MappingRun, Uncertainty
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
@@ -177,17 +178,19 @@ def to_mapping_run(
     records = record_views(best.before, graph.names, "before BA") + record_views(best.model, graph.names, "after BA")
     start_cameras = with_models(cameras, first.calibration)
     uncertainty, notes = _uncertainty(best) if options.covariance else (None, ())
+    trials = tuple(_record(trial) for trial in best.trials)
     return MappingRun(
-        to_reconstruction(best.model, graph),
-        graph,
-        four_poses(graph, first.initial_pair, start_cameras, camera_of_image),
-        tuple(records),
-        best.drops,
-        to_reconstruction(best.before, graph),
-        verdicts,
-        tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
-        (*(_describe(trial) for trial in best.trials), *(_describe_camera(c) for c in best.model.cameras), *notes),
-        uncertainty,
+        reconstruction=to_reconstruction(best.model, graph),
+        graph=graph,
+        initial_pair=four_poses(graph, first.initial_pair, start_cameras, camera_of_image),
+        records=tuple(records),
+        drops=best.drops,
+        before_bundle=to_reconstruction(best.before, graph),
+        verdicts=verdicts,
+        others=tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
+        notes=(*(_describe(trial) for trial in trials), *(_describe_camera(c) for c in best.model.cameras), *notes),
+        uncertainty=uncertainty,
+        calibration=trials,
     )
 
 
@@ -215,11 +218,23 @@ def _verdicts(graph: MatchGraph, sub_models: Sequence[SubModel], models: Sequenc
     return out
 
 
-def _describe(trial: CalibrationTrial) -> str:
+def _record(trial: CalibrationTrial) -> CameraTrial:
+    """What is kept of a camera model that was tried."""
+    return CameraTrial(
+        model=trial.step.model,
+        free=tuple(trial.step.free),
+        rms_before_px=float(trial.rms_before_px),
+        rms_after_px=float(trial.rms_after_px),
+        significance=float(trial.significance),
+        accepted=bool(trial.accepted),
+    )
+
+
+def _describe(trial: CameraTrial) -> str:
     """One line on one camera model that was tried."""
     verdict = "accepted" if trial.accepted else "refused"
     return (
-        f"calibration {trial.step.model} with {', '.join(trial.step.free)} free: held-out observations predicted to "
+        f"calibration {trial.model} with {', '.join(trial.free)} free: held-out observations predicted to "
         f"{trial.rms_after_px:.4f} px instead of {trial.rms_before_px:.4f} px "
         f"({trial.significance:+.1f} standard errors), {verdict}"
     )

@@ -58,6 +58,21 @@ class ErrorRow:
 
 
 @dataclass(frozen=True)
+class CameraTrial:
+    """A camera model that was tried: what held-out observations say of it, and whether it was taken."""
+
+    model: str
+    free: tuple[str, ...]
+    """Names of the parameters that were refined."""
+    rms_before_px: float
+    """Robust root mean square of prediction by the best model before it."""
+    rms_after_px: float
+    significance: float
+    """Of the gain, in standard errors."""
+    accepted: bool
+
+
+@dataclass(frozen=True)
 class DropRecord:
     """Observations taken out of the model at one stage, and why."""
 
@@ -113,6 +128,8 @@ class RunRecord:
     table: tuple[ErrorRow, ...]
     drops: tuple[DropRecord, ...]
     how_errors_are_counted: str
+    calibration: tuple[CameraTrial, ...] = ()
+    """Camera models that were tried on the first model, in order."""
     photos_folder: str | None = None
     """Where the photos lie, relative to the folder of the run, so that the two may move together."""
     masks_folder: str | None = None

@@ -47,7 +47,7 @@ def cleaned(
     """
     parts, count = _parts(solid_fraction >= level)
     if count == 0:
-        raise InputError("the field is nowhere dense enough for a surface; train it longer, or ask for a lower --level")
+        raise InputError("the field is nowhere dense enough for a surface; train it longer, or ask for a lower `level`")
     sizes = np.bincount(parts.reshape(-1), minlength=count + 1)[1:]
     floating = np.append(False, sizes < min_part * sizes.max())
     solid_fraction = np.where(floating[parts], 0.0, solid_fraction)

@@ -165,6 +165,7 @@ def run_record(
         table=tuple(record.row() for record in run.records),
         drops=tuple(DropRecord(drop.stage, drop.reason, drop.observations) for drop in run.drops),
         how_errors_are_counted=HOW_ERRORS_ARE_COUNTED,
+        calibration=run.calibration,
     )
 
 

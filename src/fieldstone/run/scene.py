@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from fieldstone.errors import InputError
 from fieldstone.io.posed.open import open_posed_scene
 from fieldstone.io.posed.posed_scene import PosedScene
-from fieldstone.records.mapping import ModelSummary, RunRecord
+from fieldstone.records.mapping import CameraTrial, ModelSummary, RunRecord
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import PhotoByName, mapping_figures, shrunk, thumbnails
 from fieldstone.report.page import Story
@@ -102,6 +102,11 @@ class Scene:
     def verdicts(self) -> Mapping[str, str]:
         """For every photo by name: in which model with how many points, or why in none; empty if nobody says."""
         return {} if self.record is None else {photo.name: photo.verdict for photo in self.record.photos}
+
+    @property
+    def calibration(self) -> tuple[CameraTrial, ...]:
+        """Camera models that were tried on the first model, and what held-out observations say of them."""
+        return () if self.record is None else self.record.calibration
 
     @property
     def notes(self) -> tuple[str, ...]:

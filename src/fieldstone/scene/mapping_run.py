@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.records.mapping import ErrorRow
+from fieldstone.records.mapping import CameraTrial, ErrorRow
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -98,3 +98,5 @@ class MappingRun:
     """Decisions of the mapper that a user should know of, such as the calibration it found."""
     uncertainty: Uncertainty | None = None
     """Of the reconstruction, if it was asked for."""
+    calibration: tuple[CameraTrial, ...] = ()
+    """Camera models that were tried on the reconstruction, in order."""

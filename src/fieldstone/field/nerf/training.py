@@ -77,7 +77,7 @@ def torch_device(name: str) -> torch.device:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"device {name!r} cannot be used ({reason}); use --device cpu") from error
+        raise InputError(f"device {name!r} cannot be used ({reason}); use `device` cpu") from error
     return device
 
 

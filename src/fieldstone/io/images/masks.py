@@ -27,7 +27,7 @@ def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
         InputError: No such folder, no mask in it for any of the photos, or a mask of another size than its photo.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; --masks names the folder that holds one mask for each photo")
+        raise InputError(f"{folder}: no such folder; `masks` names the folder that holds one mask for each photo")
     files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES)
     by_name = {path.name: path for path in files}
     by_stem = {path.stem: path for path in files}

@@ -30,7 +30,7 @@ def write_mesh(mesh: Mesh, path: Path) -> None:
         InputError: No such format, or an empty mesh.
     """
     if not len(mesh.faces):
-        raise InputError(f"{path}: the mesh has no faces; train the field longer or ask for a lower --level")
+        raise InputError(f"{path}: the mesh has no faces; train the field longer or ask for a lower `level`")
     writers = {".ply": _ply, ".obj": _obj, ".glb": _glb}
     writer = writers.get(path.suffix.lower())
     if writer is None:

@@ -40,7 +40,7 @@ def write_splats(splats: Splats, path: Path) -> None:
         InputError: There are none.
     """
     if not len(splats):
-        raise InputError(f"{path}: there are no splats; train the field longer or ask for a lower --level")
+        raise InputError(f"{path}: there are no splats; train the field longer or ask for a lower `level`")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     header += [*(f"property float {name}" for name in PROPERTIES), "end_header", ""]
     write_bytes(path, "\n".join(header).encode() + _rows(splats).tobytes())

@@ -145,7 +145,7 @@ def contradicts(vote: FocalVote, camera: Camera) -> bool:
 
 
 def _given_camera(options: MatchingOptions, info: PhotoInfo) -> Camera:
-    """The camera of --intrinsics, which speaks of stored pixels, for an upright photo."""
+    """The camera of given intrinsics, which speaks of stored pixels, for an upright photo."""
     assert options.intrinsics is not None
     values = np.array(options.intrinsics, dtype=np.float64)
     model = options.camera_model or ("SIMPLE_PINHOLE" if len(values) == 3 else "PINHOLE")
@@ -154,4 +154,4 @@ def _given_camera(options: MatchingOptions, info: PhotoInfo) -> Camera:
     try:
         return turned(Camera(model, int(width), int(height), values), turn)
     except ValueError as error:
-        raise InputError(f"--intrinsics {','.join(map(str, options.intrinsics))}: {error}") from error
+        raise InputError(f"`intrinsics` {','.join(map(str, options.intrinsics))}: {error}") from error
