@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from fieldstone.io.files.cache import Workspace
 from fieldstone.io.posed.model_photos import photos_of_model
 from fieldstone.progress import OnProgress, Progress, silent
 from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
-from fieldstone.report.figures import shrunk, thumbnails
+from fieldstone.report.figures import PhotoByName, shrunk, thumbnails
 from fieldstone.run.folder import RunFolder
 from fieldstone.run.map_photos import ChosenMapper, map_given_matches, map_photos, map_with_textbook
 from fieldstone.run.mapper_checkpoint import MapperCheckpoints
@@ -84,9 +84,9 @@ def reconstruct_into(
     with ThreadPoolExecutor(1) as meanwhile:
         small: list[Future[Mapping[str, np.ndarray]]] = []
 
-        def draw_thumbnails(photos: MatchedPhotos) -> None:
+        def draw_thumbnails(names: Sequence[str], photo_of: PhotoByName) -> None:
             if report:
-                small.append(meanwhile.submit(thumbnails, photos.graph.names, shrunk(photos.photo_of)))
+                small.append(meanwhile.submit(thumbnails, names, photo_of))
 
         scene = reconstructed(source, options, cache, on_progress, draw_thumbnails)
     on_progress(Progress("writing"))
@@ -100,25 +100,26 @@ def reconstructed(
     options: ReconstructOptions,
     cache: Workspace,
     on_progress: OnProgress,
-    on_matched: Callable[[MatchedPhotos], None] = lambda photos: None,
+    on_matched: Callable[[Sequence[str], PhotoByName], None] = lambda names, photo_of: None,
 ) -> Scene:
     """`reconstruct` without a folder: the stages, one after the other.
 
     Args:
         cache: Keeps what the stages find, and has what earlier runs have found.
-        on_matched: Is called with the matched photos before they are mapped.
+        on_matched: Is called with the names of the matched photos, and what decodes them, before they are mapped.
     """
     given = is_course_folder(source)
     photos = (
         read_course(source) if given else match_photos(source, options.matching(), options.seed, cache, on_progress)
     )
-    on_matched(photos)
+    photo_of = shrunk(photos.photo_of)
+    on_matched(photos.graph.names, photo_of)
     start = time.perf_counter()
     mapper, run = run_mapper(photos, options, MapperCheckpoints(cache), on_progress, given=given)
     seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
     record = run_record(source, mapper, run, photos, options.seed, seconds)
     posed = photos_of_model(run.reconstruction, source)
-    return Scene(posed, record, Mapped(run, photos.photo_of, source), options.masks)
+    return Scene(posed, record, Mapped(run, photo_of, source), options.masks)
 
 
 def run_mapper(

@@ -19,7 +19,7 @@ from fieldstone.io.posed.open import open_posed_scene
 from fieldstone.io.posed.posed_scene import PosedScene
 from fieldstone.records.mapping import CameraTrial, ModelSummary, RunRecord
 from fieldstone.report.figure_store import write_figures
-from fieldstone.report.figures import PhotoByName, mapping_figures, shrunk, thumbnails
+from fieldstone.report.figures import PhotoByName, mapping_figures, thumbnails
 from fieldstone.report.page import Story
 from fieldstone.run.folder import RunFolder
 from fieldstone.scene.mapping_run import MappingRun
@@ -37,7 +37,7 @@ class Mapped:
     run: MappingRun
     """The models, the matched photos behind them, and what every stage did."""
     photo_of: PhotoByName
-    """Decodes a photo by its name, no finer than figures need."""
+    """A photo by its name in the size of figures; the last ones asked for are kept."""
     photos_folder: Path
 
 
@@ -188,7 +188,7 @@ def write_scene(
     out.write_models(scene.models)
     out.write_covariance(run.uncertainty, run.graph.names)
     if report:
-        photo_of = shrunk(scene.mapped.photo_of)
+        photo_of = scene.mapped.photo_of
         small = thumbnails(run.graph.names, photo_of) if small is None else small
         write_figures(out.figures, "mapping", mapping_figures(run, photo_of), small)
     seconds = {**scene.record.seconds, "writing": round(time.perf_counter() - start, 3)}
