@@ -5,9 +5,9 @@ import logging
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.ExifTags import Base
 
 from fieldstone.errors import InputError
-from fieldstone.io.images.exif import ORIENTATION
 from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
 from fieldstone.io.images.photos import read_photo, read_photo_info, write_photo
 
@@ -45,7 +45,7 @@ def test_a_mask_in_stored_pixels_turns_with_its_photo(tmp_path, orientation):
     grey = np.zeros((6, 8), dtype=np.uint8)
     grey[:3, :5] = 255
     exif = Image.Exif()
-    exif[ORIENTATION] = orientation
+    exif[Base.Orientation] = orientation
     Image.fromarray(np.dstack([grey] * 3)).save(tmp_path / "a.png", exif=exif)
     photo = read_photo(tmp_path / "a.png")
     upright = photo.rgb[:, :, 0] > 0

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from fieldstone.errors import InputError
-from fieldstone.io.course.matching_txt import is_course_folder, read_calibration, read_course_folder, read_matching_txt
+from fieldstone.io.given_matches.matching_txt import is_given_matches_folder, read_calibration, read_given_matches
 from fieldstone.io.images.photos import write_photo
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
 from mutations import check_mutations
@@ -24,8 +24,8 @@ def make_scene(num_cameras: int = 4) -> SyntheticScene:
     return synthesize(SceneOptions(num_cameras=num_cameras, num_points=40, visibility=0.8), np.random.default_rng(0))
 
 
-def write_course_folder(folder: Path, scene: SyntheticScene, *, photos: bool = True, newline: str = "\n") -> None:
-    """The scene in the course's format; every other line of three or more photos is split into lines of two."""
+def write_given_matches(folder: Path, scene: SyntheticScene, *, photos: bool = True, newline: str = "\n") -> None:
+    """The scene with given matches; every other line of three or more photos is split into lines of two."""
     folder.mkdir(exist_ok=True)
     (folder / "calibration.txt").write_text(K_TEXT)
     truth = scene.truth
@@ -69,20 +69,20 @@ def matched_places(graph) -> dict:
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r\n\r\n"])
 def test_a_written_scene_is_read_back(tmp_path, photos, newline):
     scene = make_scene()
-    write_course_folder(tmp_path, scene, photos=photos, newline=newline)
-    course = read_course_folder(tmp_path)
-    assert course.graph.names == ("1.png", "2.png", "3.png", "4.png")
-    assert matched_places(course.graph) == matched_places(scene.graph)
-    assert course.num_repeated == 0
-    assert not course.dropped_by_missing_photo
-    np.testing.assert_allclose(course.camera.params, scene.truth.cameras[0].params, rtol=1e-12)
+    write_given_matches(tmp_path, scene, photos=photos, newline=newline)
+    given = read_given_matches(tmp_path)
+    assert given.graph.names == ("1.png", "2.png", "3.png", "4.png")
+    assert matched_places(given.graph) == matched_places(scene.graph)
+    assert given.num_repeated == 0
+    assert not given.dropped_by_missing_photo
+    np.testing.assert_allclose(given.camera.params, scene.truth.cameras[0].params, rtol=1e-12)
     if photos:
-        assert (course.camera.width, course.camera.height) == (1000, 750)
-        assert course.photos == tuple(tmp_path / f"{k}.png" for k in (1, 2, 3, 4))
+        assert (given.camera.width, given.camera.height) == (1000, 750)
+        assert given.photos == tuple(tmp_path / f"{k}.png" for k in (1, 2, 3, 4))
     else:
-        assert course.photos == (None,) * 4
-        beyond = np.concatenate(course.graph.keypoints).max(axis=0)
-        assert np.all(beyond <= [course.camera.width, course.camera.height])
+        assert given.photos == (None,) * 4
+        beyond = np.concatenate(given.graph.keypoints).max(axis=0)
+        assert np.all(beyond <= [given.camera.width, given.camera.height])
 
 
 def test_a_place_is_one_keypoint_in_however_many_lines(tmp_path):
@@ -91,8 +91,8 @@ def test_a_place_is_one_keypoint_in_however_many_lines(tmp_path):
         "nFeatures: 9\n2 1 2 3 10 20 2 30 40\n2 1 2 3 10 20 3 50 60\n2 1 2 3 10 20 2 30 40\n1 7 7 7 90 91\n"
     )
     (tmp_path / "matching2.txt").write_text("nFeatures: 9\n2 9 9 9 30 40 3 50 60\n")
-    course = read_course_folder(tmp_path)
-    graph = course.graph
+    given = read_given_matches(tmp_path)
+    graph = given.graph
     np.testing.assert_array_equal(graph.keypoints[0], [[10.5, 20.5], [90.5, 91.5]])
     np.testing.assert_array_equal(graph.keypoints[1], [[30.5, 40.5]])
     np.testing.assert_array_equal(graph.keypoints[2], [[50.5, 60.5]])
@@ -103,8 +103,8 @@ def test_a_place_is_one_keypoint_in_however_many_lines(tmp_path):
         (0, 2): [[0, 0]],
         (1, 2): [[0, 0]],
     }
-    assert course.num_given == {(0, 1): 2, (0, 2): 1, (1, 2): 1}
-    assert course.num_repeated == 1
+    assert given.num_given == {(0, 1): 2, (0, 2): 1, (1, 2): 1}
+    assert given.num_repeated == 1
 
 
 @pytest.mark.parametrize(
@@ -172,40 +172,40 @@ def test_wrong_calibrations_name_file_and_line(tmp_path, text, message):
     ],
 )
 def test_wrong_match_files_name_file_and_line(tmp_path, text, message):
-    write_course_folder(tmp_path, make_scene())
+    write_given_matches(tmp_path, make_scene())
     (tmp_path / "matching1.txt").write_text(text)
     with pytest.raises(InputError, match=rf"matching1.txt, {message}"):
-        read_matching_txt(tmp_path)
+        read_given_matches(tmp_path)
 
 
 def test_matches_with_missing_photos_are_dropped_and_counted(tmp_path, caplog):
     scene = make_scene()
-    write_course_folder(tmp_path, scene)
+    write_given_matches(tmp_path, scene)
     (tmp_path / "4.png").unlink()
-    course = read_course_folder(tmp_path)
-    assert course.graph.names == ("1.png", "2.png", "3.png")
+    given = read_given_matches(tmp_path)
+    assert given.graph.names == ("1.png", "2.png", "3.png")
     with_last = sum(len(rows) for pair, rows in scene.graph.matches.items() if 3 in pair)
-    assert course.dropped_by_missing_photo == {4: with_last}
+    assert given.dropped_by_missing_photo == {4: with_last}
     assert f"dropped {with_last} of" in caplog.text
-    assert matched_places(course.graph) == {p: m for p, m in matched_places(scene.graph).items() if 3 not in p}
+    assert matched_places(given.graph) == {p: m for p, m in matched_places(scene.graph).items() if 3 not in p}
 
     (tmp_path / "2.png").write_bytes((tmp_path / "2.png").read_bytes()[:-30])  # a broken photo counts as missing
-    course = read_course_folder(tmp_path)
-    assert course.graph.names == ("1.png", "3.png")
-    assert [problem.path.name for problem in course.problems] == ["2.png"]
-    assert set(course.graph.matches) == {(0, 1)}
-    assert matched_places(course.graph)[0, 1] == matched_places(scene.graph)[0, 2]
+    given = read_given_matches(tmp_path)
+    assert given.graph.names == ("1.png", "3.png")
+    assert [problem.path.name for problem in given.problems] == ["2.png"]
+    assert set(given.graph.matches) == {(0, 1)}
+    assert matched_places(given.graph)[0, 1] == matched_places(scene.graph)[0, 2]
 
     (tmp_path / "3.png").unlink()
     with pytest.raises(InputError, match=r"none of its .* matches joins two photos"):
-        read_course_folder(tmp_path)
+        read_given_matches(tmp_path)
 
 
 def test_photos_without_numbers_count_in_natural_order(tmp_path):
-    write_course_folder(tmp_path, make_scene())
+    write_given_matches(tmp_path, make_scene())
     for i, name in enumerate(["hall_2.png", "hall_3.jpg", "hall_10.png", "hall_11.png"], start=1):
         (tmp_path / f"{i}.png").rename(tmp_path / name)
-    assert read_matching_txt(tmp_path)[0].names == ("hall_2.png", "hall_3.jpg", "hall_10.png", "hall_11.png")
+    assert read_given_matches(tmp_path).graph.names == ("hall_2.png", "hall_3.jpg", "hall_10.png", "hall_11.png")
 
 
 @pytest.mark.parametrize(
@@ -222,34 +222,34 @@ def test_photos_without_numbers_count_in_natural_order(tmp_path):
     ],
 )
 def test_folders_that_cannot_be_used_say_why(tmp_path, change, message):
-    write_course_folder(tmp_path, make_scene())
+    write_given_matches(tmp_path, make_scene())
     change(tmp_path)
     with pytest.raises(InputError, match=message):
-        read_matching_txt(tmp_path)
+        read_given_matches(tmp_path)
 
 
 def test_a_file_without_features_is_read(tmp_path):
     scene = make_scene()
-    write_course_folder(tmp_path, scene)
+    write_given_matches(tmp_path, scene)
     (tmp_path / "matching2.txt").write_text("nFeatures: 0")
-    graph = read_course_folder(tmp_path).graph
+    graph = read_given_matches(tmp_path).graph
     assert set(graph.matches) == {pair for pair in scene.graph.matches if pair[0] != 1}
 
 
-def test_a_course_folder_is_known_by_its_match_files(tmp_path):
+def test_a_data_set_with_given_matches_is_known_by_its_match_files(tmp_path):
     (tmp_path / "calibration.txt").write_text(K_TEXT)
-    assert not is_course_folder(tmp_path)
+    assert not is_given_matches_folder(tmp_path)
     (tmp_path / "Matching3.TXT").write_text("nFeatures: 0")
-    assert is_course_folder(tmp_path)
-    assert not is_course_folder(tmp_path / "calibration.txt")
+    assert is_given_matches_folder(tmp_path)
+    assert not is_given_matches_folder(tmp_path / "calibration.txt")
 
 
 @pytest.mark.parametrize("name", ["matching1.txt", "matching2.txt", "calibration.txt"])
 def test_damaged_files_end_in_an_input_error_or_a_sound_graph(tmp_path, name):
-    write_course_folder(tmp_path, make_scene(3), photos=False)
+    write_given_matches(tmp_path, make_scene(3), photos=False)
 
-    def check(result):
-        graph, camera = result
+    def check(given):
+        graph, camera = given.graph, given.camera
         assert camera.focal.min() > 0
         for (i, j), rows in graph.matches.items():
             assert rows[:, 0].max() < len(graph.keypoints[i])
@@ -257,14 +257,14 @@ def test_damaged_files_end_in_an_input_error_or_a_sound_graph(tmp_path, name):
         for keypoints in graph.keypoints:
             assert np.isfinite(keypoints).all()
 
-    loaded, refused = check_mutations(tmp_path / name, lambda: read_matching_txt(tmp_path), check, count=300)
+    loaded, refused = check_mutations(tmp_path / name, lambda: read_given_matches(tmp_path), check, count=300)
     assert min(loaded, refused) > 10
 
 
 def test_unity_hall_has_its_known_counts():
-    course = read_course_folder(data_folder("unity_hall"))
-    assert (course.num_given[0, 1], course.num_given[2, 3], course.num_given[0, 4]) == (672, 1183, 206)
-    assert course.graph.names == ("1.png", "2.png", "3.png", "4.png", "5.png")
-    assert (course.camera.width, course.camera.height) == (800, 600)
-    np.testing.assert_allclose(course.camera.params, [531.122155, 531.541738, 407.692551, 313.808715], atol=1e-6)
-    assert sum(course.num_given.values()) - course.num_repeated == sum(len(m) for m in course.graph.matches.values())
+    given = read_given_matches(data_folder("unity_hall"))
+    assert (given.num_given[0, 1], given.num_given[2, 3], given.num_given[0, 4]) == (672, 1183, 206)
+    assert given.graph.names == ("1.png", "2.png", "3.png", "4.png", "5.png")
+    assert (given.camera.width, given.camera.height) == (800, 600)
+    np.testing.assert_allclose(given.camera.params, [531.122155, 531.541738, 407.692551, 313.808715], atol=1e-6)
+    assert sum(given.num_given.values()) - given.num_repeated == sum(len(m) for m in given.graph.matches.values())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.files.cache import Workspace
+from fieldstone.io.files.cache import UnitCache
 from fieldstone.mapping.incremental.mapper import map_incremental
 from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.incremental.state import SubModel
@@ -28,8 +28,8 @@ class Fragile(MapperCheckpoints):
 
     def keep(self, name, arrays, facts):
         super().keep(name, arrays, facts)
-        assert self.workspace.folder is not None
-        count = self.workspace.folder / "count"
+        assert self.cache.folder is not None
+        count = self.cache.folder / "count"
         done = int(count.read_text()) + 1 if count.exists() else 1
         count.write_text(str(done))
         if done in (2, 4):
@@ -59,13 +59,13 @@ def bits(sub_models: list[SubModel]) -> list:
 
 def test_registration_goes_on_to_the_same_bits(scene, tmp_path):
     whole = bits(register(scene))
-    store = Fragile(Workspace(tmp_path))
+    store = Fragile(UnitCache(tmp_path))
     for _ in range(2):
         with pytest.raises(Stopped):
             register(scene, store)
     assert bits(register(scene, store, threads=2)) == whole
     total = int((tmp_path / "count").read_text())
-    whole_store = MapperCheckpoints(Workspace(tmp_path / "whole"))
+    whole_store = MapperCheckpoints(UnitCache(tmp_path / "whole"))
     assert bits(register(scene, whole_store)) == whole
     assert total <= 9  # two of them made, and none made twice
     store.forget()
@@ -73,7 +73,7 @@ def test_registration_goes_on_to_the_same_bits(scene, tmp_path):
 
 
 def test_another_seed_or_graph_finds_nothing(scene, tmp_path):
-    store = MapperCheckpoints(Workspace(tmp_path))
+    store = MapperCheckpoints(UnitCache(tmp_path))
     register(scene, store)
     names = {path.stem for path in tmp_path.glob("mapper/*")}
     register(scene, store, seed=1)

@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from PIL.ExifTags import IFD
+from PIL.ExifTags import IFD, Base
 
 from fieldstone.cli import main
 from fieldstone.errors import InputError
 from fieldstone.features.sift import SiftOptions
-from fieldstone.io.files.cache import Workspace
-from fieldstone.io.images.exif import FOCAL_LENGTH_35MM
+from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.models.colmap import read_colmap
 from fieldstone.progress import Progress
 from fieldstone.run.matching.detection import sharpness
@@ -44,14 +43,14 @@ def photos(house_photos, tmp_path) -> Path:
 
 
 def matched(photos: Path, options: MatchingOptions = OPTIONS):
-    return match_photos(photos, options, 0, Workspace())
+    return match_photos(photos, options, 0, UnitCache())
 
 
 def test_progress_counts_photos_and_pairs_also_of_an_earlier_run(photos, tmp_path):
-    workspace = Workspace(tmp_path / "units")
+    cache = UnitCache(tmp_path / "units")
     for _ in range(2):
         events: list[Progress] = []
-        found = match_photos(photos, OPTIONS, 0, workspace, events.append)
+        found = match_photos(photos, OPTIONS, 0, cache, events.append)
         assert list(dict.fromkeys(e.stage for e in events)) == ["finding features", "matching", "verifying pairs"]
         num_files = len(found.graph.names) + len(found.problems)
         for stage, total in (("finding features", num_files), ("verifying pairs", len(found.graph.matches))):
@@ -69,12 +68,12 @@ def test_no_features_under_masks(photos, tmp_path):
     options = replace(OPTIONS, masks=tmp_path / "masks")
     graph = matched(photos, options).graph
     assert max(k[:, 0].max() for k in graph.keypoints) < 200.0
-    workspace = Workspace(tmp_path / "units")
+    cache = UnitCache(tmp_path / "units")
     for _ in range(2):
-        again = match_photos(photos, options, 0, workspace).graph
+        again = match_photos(photos, options, 0, cache).graph
         np.testing.assert_array_equal(again.keypoints[3], graph.keypoints[3])
     Image.fromarray(255 - keep).save(tmp_path / "masks" / "house_03.jpg.png")
-    changed = match_photos(photos, options, 0, workspace).graph
+    changed = match_photos(photos, options, 0, cache).graph
     assert changed.keypoints[3][:, 0].min() >= 200.0
     np.testing.assert_array_equal(changed.keypoints[2], graph.keypoints[2])
 
@@ -228,7 +227,7 @@ def shoot(house: House, poses, folder: Path, name: str) -> None:
     for k, pose in enumerate(poses):
         pixels = photograph(house, HOUSE.camera(), pose, HOUSE, np.random.default_rng(k))
         exif = Image.Exif()
-        exif.get_ifd(IFD.Exif)[FOCAL_LENGTH_35MM] = HOUSE.focal_35mm
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = HOUSE.focal_35mm
         Image.fromarray(pixels).save(folder / f"{name}_{k}.jpg", quality=95, exif=exif)
 
 
@@ -273,6 +272,6 @@ def rewrite_focal(photos: Path, focal_35mm: float) -> None:
     for path in photos.iterdir():
         with Image.open(path) as image:
             exif = image.getexif()
-            exif.get_ifd(IFD.Exif)[FOCAL_LENGTH_35MM] = round(focal_35mm)
+            exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = round(focal_35mm)
             image.load()
             image.save(path, exif=exif, quality=95)

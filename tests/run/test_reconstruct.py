@@ -11,7 +11,7 @@ import pytest
 from fieldstone.cli import main
 from fieldstone.evaluate.reconstruction_metrics import pairwise_pose_errors_deg
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.course.matching_txt import read_course_folder
+from fieldstone.io.given_matches.matching_txt import read_given_matches
 from fieldstone.io.models.colmap import read_colmap
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction, View
@@ -21,16 +21,16 @@ from matchers import assert_reconstruction_near
 from real_data import data_folder
 
 
-def write_course_folder(folder: Path, *, matlab: bool = False, seed: int = 0) -> Reconstruction:
-    """A synthetic scene in the course format, without photos; returns the truth."""
+def write_given_matches(folder: Path, *, matlab: bool = False, seed: int = 0) -> Reconstruction:
+    """A synthetic scene with given matches, without photos; returns the truth."""
     options = SceneOptions(num_cameras=4, num_points=150, layout="arc", noise_px=0.3, outlier_share=0.1)
     scene = synthesize(options, np.random.default_rng(seed))
-    write_course(scene.graph, scene.truth.cameras[0], folder, matlab=matlab)
+    write_matching_txt(scene.graph, scene.truth.cameras[0], folder, matlab=matlab)
     return scene.truth
 
 
-def write_course(graph: MatchGraph, camera: Camera, folder: Path, *, matlab: bool = False) -> None:
-    """Matches in the course format; photo k of the graph is photo k + 1 of the folder."""
+def write_matching_txt(graph: MatchGraph, camera: Camera, folder: Path, *, matlab: bool = False) -> None:
+    """Matches as `matching*.txt`; photo k of the graph is photo k + 1 of the folder."""
     K = camera.calibration_matrix()
     K[:2, 2] -= 0.5
     rows = [" ".join(repr(float(x)) for x in row) for row in K]
@@ -56,7 +56,7 @@ def write_course(graph: MatchGraph, camera: Camera, folder: Path, *, matlab: boo
 def test_given_matches_of_a_symmetric_building_are_not_folded(tmp_path, max_view_change_deg):
     options = SymmetricOptions(points_per_side=200, max_view_change_deg=max_view_change_deg)
     scene = synthesize_symmetric(options, np.random.default_rng(0))
-    write_course(scene.graph, scene.truth.cameras[0], tmp_path / "scene")
+    write_matching_txt(scene.graph, scene.truth.cameras[0], tmp_path / "scene")
     assert main(["reconstruct", str(tmp_path / "scene"), "-o", str(tmp_path / "out")]) == 0
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert any("ambiguous scene" in note for note in record["notes"])
@@ -69,8 +69,8 @@ def test_given_matches_of_a_symmetric_building_are_not_folded(tmp_path, max_view
 
 
 @pytest.mark.parametrize("matlab", [False, True], ids=["plain, LF", "MATLAB, CRLF"])
-def test_course_folder_gives_model_table_and_report(tmp_path, matlab):
-    truth = write_course_folder(tmp_path / "scene", matlab=matlab)
+def test_given_matches_give_model_table_and_report(tmp_path, matlab):
+    truth = write_given_matches(tmp_path / "scene", matlab=matlab)
     out = tmp_path / "out"
     assert main(["reconstruct", str(tmp_path / "scene"), "-o", str(out)]) == 0
     record = json.loads((out / "run.json").read_text())
@@ -97,8 +97,8 @@ def test_course_folder_gives_model_table_and_report(tmp_path, matlab):
 def peer_model(folder: Path, out: Path):
     """pycolmap's incremental mapper on the same matches, with the same fixed camera."""
     pycolmap = pytest.importorskip("pycolmap")
-    course = read_course_folder(folder)
-    graph, camera, database = course.graph, course.camera, out / "database.db"
+    given = read_given_matches(folder)
+    graph, camera, database = given.graph, given.camera, out / "database.db"
     reader, options = pycolmap.ImageReaderOptions(), pycolmap.IncrementalPipelineOptions()
     reader.camera_model, reader.camera_params = camera.model, ",".join(map(str, camera.params))
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
@@ -144,8 +144,8 @@ def test_hall_beats_the_peer_and_the_peer_agrees_on_the_error(tmp_path):
 
 
 @pytest.fixture
-def course(tmp_path) -> Path:
-    write_course_folder(tmp_path / "scene")
+def folder(tmp_path) -> Path:
+    write_given_matches(tmp_path / "scene")
     return tmp_path / "scene"
 
 
@@ -155,8 +155,8 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def broken(course: Path, case: str) -> None:
-    matching = course / "matching1.txt"
+def broken(folder: Path, case: str) -> None:
+    matching = folder / "matching1.txt"
     first = matching.read_text().splitlines()[1].split()
     match case:
         case "count":
@@ -168,22 +168,22 @@ def broken(course: Path, case: str) -> None:
         case "zero id":
             edit(matching, " ".join(first), " ".join([*first[:6], "0", *first[7:]]))
         case "zero focal":
-            (course / "calibration.txt").write_text("0 0 500\n0 800 300\n0 0 1\n")
+            (folder / "calibration.txt").write_text("0 0 500\n0 800 300\n0 0 1\n")
         case "empty":
-            shutil.rmtree(course)
-            course.mkdir()
+            shutil.rmtree(folder)
+            folder.mkdir()
 
 
 @pytest.mark.parametrize("case", ["count", "negative", "nan", "zero id", "zero focal", "empty"])
-def test_bad_input_is_one_line_and_nothing_is_written(course, tmp_path, capsys, case):
-    broken(course, case)
+def test_bad_input_is_one_line_and_nothing_is_written(folder, tmp_path, capsys, case):
+    broken(folder, case)
     out = tmp_path / "out"
-    assert main(["reconstruct", str(course), "-o", str(out)]) == 3
+    assert main(["reconstruct", str(folder), "-o", str(out)]) == 3
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert message.startswith("fieldstone: ")
     assert "Traceback" not in message
-    assert str(course) in message
+    assert str(folder) in message
     if case in ("count", "negative", "nan", "zero id"):
         assert "matching1.txt" in message
         assert "line 2" in message or ":2" in message

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.scene.tracks import Observations, build_tracks, compact_points, visibility_matrix
+from fieldstone.scene.tracks import Observations, build_tracks, compact_points
 
 
 def graph_of(keypoints: list[np.ndarray], matches: dict) -> MatchGraph:
@@ -110,12 +110,9 @@ def test_no_matches_give_no_tracks():
     assert len(build_tracks(graph_of([np.zeros((3, 2))] * 2, {(0, 1): []}))[0]) == 0
 
 
-def test_visibility_and_compaction():
+def test_compaction():
     observations = build_tracks(random_graph(1))[0]
     num_points = int(observations.point[-1]) + 1
-    dense = visibility_matrix(observations, 5, num_points).toarray()
-    assert dense.sum() == len(observations)
-    assert all(dense[v, p] for v, p in zip(observations.view, observations.point, strict=True))
     keep = np.arange(num_points) % 2 == 1
     compacted = compact_points(observations, keep)
     assert as_sets(compacted) == {

@@ -16,7 +16,7 @@ import numpy as np
 
 from fieldstone.errors import InputError
 from fieldstone.io.files.atomic import write_json, write_text
-from fieldstone.io.files.cache import Workspace
+from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.files.checkpoint import read_checkpoint, write_checkpoint
 from fieldstone.io.files.lock import sole_writer
 from fieldstone.io.models.colmap import write_colmap
@@ -128,7 +128,7 @@ class RunFolder:
         return self.path / f"mesh{suffix}"
 
     @contextmanager
-    def sole_writer(self, *, fresh: bool = False) -> Iterator[Workspace]:
+    def sole_writer(self, *, fresh: bool = False) -> Iterator[UnitCache]:
         """Hold the folder for this process; every verb that writes does so first.
 
         Args:
@@ -143,7 +143,7 @@ class RunFolder:
         with sole_writer(self.path) as work:
             if fresh:
                 shutil.rmtree(work / UNITS, ignore_errors=True)
-            yield Workspace(work / UNITS)
+            yield UnitCache(work / UNITS)
 
     def relative(self, path: Path) -> str:
         """A path as seen from this folder, so that both may move together."""

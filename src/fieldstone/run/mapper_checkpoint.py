@@ -7,25 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from fieldstone.io.files.cache import Unit, Workspace, code_version, key_of
+from fieldstone.io.files.cache import Unit, UnitCache, code_version, key_of
 
 STAGE = "mapper"
 
 
 @dataclass(frozen=True)
 class MapperCheckpoints:
-    """A `mapping.incremental.checkpoint.CheckpointStore` over the workspace of a run."""
+    """A `mapping.incremental.checkpoint.CheckpointStore` over the cache of a run."""
 
-    workspace: Workspace
+    cache: UnitCache
 
     def find(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """Arrays and facts of the last state."""
-        unit = self.workspace.find(STAGE, name)
+        unit = self.cache.find(STAGE, name)
         return None if unit is None else (dict(unit.arrays), dict(unit.facts))
 
     def keep(self, name: str, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
         """Replace the last state."""
-        self.workspace.keep(STAGE, name, Unit(arrays, facts))
+        self.cache.keep(STAGE, name, Unit(arrays, facts))
 
     def name_of(self, *parts: Any) -> str:
         """A name for plain values, option dataclasses and arrays: equal parts, equal names."""
@@ -33,4 +33,4 @@ class MapperCheckpoints:
 
     def forget(self) -> None:
         """Delete all states: the models are finished and written."""
-        self.workspace.forget_others(STAGE, [])
+        self.cache.forget_others(STAGE, [])

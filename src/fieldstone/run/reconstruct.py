@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from fieldstone import __version__
-from fieldstone.io.course.matching_txt import is_course_folder
-from fieldstone.io.files.cache import Workspace
+from fieldstone.io.files.cache import UnitCache
+from fieldstone.io.given_matches.matching_txt import is_given_matches_folder
 from fieldstone.io.posed.model_photos import photos_of_model
 from fieldstone.progress import OnProgress, Progress, silent
 from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
@@ -20,7 +20,7 @@ from fieldstone.report.figures import PhotoByName, shrunk, thumbnails
 from fieldstone.run.folder import RunFolder
 from fieldstone.run.map_photos import ChosenMapper, map_given_matches, map_photos, map_with_textbook
 from fieldstone.run.mapper_checkpoint import MapperCheckpoints
-from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_course
+from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_matched_photos
 from fieldstone.run.reconstruct_options import ReconstructOptions
 from fieldstone.run.scene import Mapped, Scene, sizes_of, summary_of, write_scene
 from fieldstone.scene.mapping_run import MappingRun
@@ -65,7 +65,7 @@ def reconstruct(
     """
     options = options or ReconstructOptions(**settings)
     if keep_in is None:
-        return reconstructed(Path(source), options, Workspace(), on_progress)
+        return reconstructed(Path(source), options, UnitCache(), on_progress)
     out = RunFolder(Path(keep_in))
     with out.sole_writer(fresh=options.fresh) as cache:
         return reconstruct_into(out, cache, Path(source), options, report=report, on_progress=on_progress)
@@ -73,7 +73,7 @@ def reconstruct(
 
 def reconstruct_into(
     out: RunFolder,
-    cache: Workspace,
+    cache: UnitCache,
     source: Path,
     options: ReconstructOptions,
     *,
@@ -98,7 +98,7 @@ def reconstruct_into(
 def reconstructed(
     source: Path,
     options: ReconstructOptions,
-    cache: Workspace,
+    cache: UnitCache,
     on_progress: OnProgress,
     on_matched: Callable[[Sequence[str], PhotoByName], None] = lambda names, photo_of: None,
 ) -> Scene:
@@ -108,9 +108,11 @@ def reconstructed(
         cache: Keeps what the stages find, and has what earlier runs have found.
         on_matched: Is called with the names of the matched photos, and what decodes them, before they are mapped.
     """
-    given = is_course_folder(source)
+    given = is_given_matches_folder(source)
     photos = (
-        read_course(source) if given else match_photos(source, options.matching(), options.seed, cache, on_progress)
+        read_matched_photos(source)
+        if given
+        else match_photos(source, options.matching(), options.seed, cache, on_progress)
     )
     photo_of = shrunk(photos.photo_of)
     on_matched(photos.graph.names, photo_of)

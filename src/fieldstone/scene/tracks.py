@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from fieldstone.scene.match_graph import MatchGraph
@@ -164,12 +164,6 @@ def _joinable(
         places[large] = {**places.pop(small), **places[large]}
         out[k] = True
     return out
-
-
-def visibility_matrix(observations: Observations, num_views: int, num_points: int) -> csr_matrix:
-    """Sparse boolean (num_views, num_points): entry (i, j) says that view i sees point j."""
-    entries = np.ones(len(observations), dtype=bool)
-    return csr_matrix((entries, (observations.view, observations.point)), shape=(num_views, num_points))
 
 
 def compact_points(observations: Observations, keep: Bool[np.ndarray, "p"]) -> Observations:

@@ -7,25 +7,10 @@ that passes is exp(-optical depth).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import erf
-
-
-class AnalyticDensity(Protocol):
-    """A density with a known integral along rays."""
-
-    def density(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """sigma at points."""
-        ...
-
-    def optical_depth(
-        self, origins: Float[np.ndarray, "r 3"], directions: Float[np.ndarray, "r 3"], t0: float, t1: float
-    ) -> Float[np.ndarray, "r"]:
-        """Integral of sigma along each ray from t0 to t1."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

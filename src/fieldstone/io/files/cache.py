@@ -9,12 +9,12 @@ units are made anew.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,7 +51,7 @@ class Packing:
 
 
 @dataclass(frozen=True)
-class Workspace:
+class UnitCache:
     """The folder of one run's units; without a folder, nothing is kept and nothing is found."""
 
     folder: Path | None = None
@@ -102,7 +102,7 @@ def key_of(*parts: Any) -> str:
     return digest.hexdigest()[:32]
 
 
-@cache
+@functools.cache
 def code_version() -> str:
     """Hash of this program's sources: other code may give other results, whatever the version says."""
     package = Path(fieldstone.__file__).resolve().parent
@@ -124,7 +124,7 @@ def file_hash(path: Path) -> str:
 
 
 def resumed(
-    workspace: Workspace,
+    cache: UnitCache,
     stage: str,
     keys: Sequence[str],
     items: Sequence[Item],
@@ -139,9 +139,9 @@ def resumed(
     Returns:
         The value of every item, as if `work` had been given all.
     """
-    if workspace.folder is None:
+    if cache.folder is None:
         return list(work(items))
-    found = workspace.find_all(stage)
+    found = cache.find_all(stage)
     values = {key: packing.unpack(found[key]) for key in keys if key in found}
     missing = [(key, item) for key, item in zip(keys, items, strict=True) if key not in values]
     if values:
@@ -152,12 +152,12 @@ def resumed(
         values[key] = packing.unpack(unit)
         batch[key] = unit
         if len(batch) == BATCH:
-            workspace.keep_together(stage, batch, key_of(*batch))
+            cache.keep_together(stage, batch, key_of(*batch))
             batch = {}
     name = key_of(*sorted(keys))
     if missing or set(found) != set(keys):
-        workspace.keep_together(stage, {key: packing.pack(values[key]) for key in keys}, name)
-    workspace.forget_others(stage, [name])
+        cache.keep_together(stage, {key: packing.pack(values[key]) for key in keys}, name)
+    cache.forget_others(stage, [name])
     return [values[key] for key in keys]
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
-from PIL.ExifTags import IFD
+from PIL.ExifTags import GPS, IFD, Base
 
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 """Of a 35 mm film frame: 43.27 mm."""
@@ -16,12 +16,6 @@ SMALLEST_SENSOR_MM = 4.0
 """Longer side; cameras with smaller sensors (phones) give the 35 mm equivalent."""
 PLAUSIBLE_FOCAL = (0.1, 20.0)
 """Range of the focal length, as a share of the longer side, outside which EXIF is taken for wrong."""
-
-MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
-FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
-STORED_WIDTH, STORED_HEIGHT = 0xA002, 0xA003
-FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 0xA20E, 0xA210
-LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
 
 
 @dataclass(frozen=True)
@@ -48,10 +42,10 @@ def exif_facts(image: Image.Image) -> tuple[int, ExifFacts]:
     """Orientation (1 to 8; 1 if absent or invalid) of the stored pixels, and the other facts."""
     # Pillow's own method for PNG decodes the pixels first, in search of EXIF behind them.
     exif = Image.Image.getexif(image)
-    orientation = exif.get(ORIENTATION, 1)
+    orientation = exif.get(Base.Orientation, 1)
     if not isinstance(orientation, int) or not 1 <= orientation <= 8:
         orientation = 1
-    words = [str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL)]
+    words = [str(exif.get(tag, "")).strip("\0 ") for tag in (Base.Make, Base.Model)]
     camera = " ".join(word for word in words if word) or None
     focal = _focal_px(exif.get_ifd(IFD.Exif), *image.size)
     return orientation, ExifFacts(focal, camera, _gps(exif.get_ifd(IFD.GPSInfo)))
@@ -65,12 +59,12 @@ def _focal_px(tags: dict[int, Any], width: int, height: int) -> float | None:
     the new width too, the sensor comes out impossibly small, and the tags say nothing.
     """
     diagonal = math.hypot(width, height)
-    equivalent = _number(tags.get(FOCAL_LENGTH_35MM))
+    equivalent = _number(tags.get(Base.FocalLengthIn35mmFilm))
     candidates = [] if equivalent is None else [equivalent / FILM_DIAGONAL_MM * diagonal]
-    focal_mm, resolution = _number(tags.get(FOCAL_LENGTH)), _number(tags.get(FOCAL_PLANE_X))
-    unit = tags.get(FOCAL_PLANE_UNIT, 2)
+    focal_mm, resolution = _number(tags.get(Base.FocalLength)), _number(tags.get(Base.FocalPlaneXResolution))
+    unit = tags.get(Base.FocalPlaneResolutionUnit, 2)
     if focal_mm is not None and resolution is not None and unit in MM_PER_RESOLUTION_UNIT:
-        stored = max(_number(tags.get(STORED_WIDTH)) or 0.0, _number(tags.get(STORED_HEIGHT)) or 0.0)
+        stored = max(_number(tags.get(tag)) or 0.0 for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
         stored = stored or max(width, height)
         pixels_per_mm = resolution / MM_PER_RESOLUTION_UNIT[unit]
         if stored >= SMALLEST_SENSOR_MM * pixels_per_mm:
@@ -81,12 +75,12 @@ def _focal_px(tags: dict[int, Any], width: int, height: int) -> float | None:
 
 def _gps(tags: dict[int, Any]) -> Gps | None:
     """Degrees from (degrees, minutes, seconds) and hemisphere letters."""
-    latitude = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "S", 90.0)
-    longitude = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "W", 180.0)
+    latitude = _degrees(tags.get(GPS.GPSLatitude), tags.get(GPS.GPSLatitudeRef), "S", 90.0)
+    longitude = _degrees(tags.get(GPS.GPSLongitude), tags.get(GPS.GPSLongitudeRef), "W", 180.0)
     if latitude is None or longitude is None:
         return None
-    altitude = _number(tags.get(ALTITUDE))
-    below_sea = tags.get(ALTITUDE_REF) in (1, b"\x01")
+    altitude = _number(tags.get(GPS.GPSAltitude))
+    below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     return Gps(latitude, longitude, None if altitude is None else -altitude if below_sea else altitude)
 
 

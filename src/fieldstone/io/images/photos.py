@@ -10,7 +10,7 @@ import struct
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,27 +170,6 @@ def read_photo(path: Path, *, at_least_px: int | None = None, max_megapixels: fl
         except DAMAGE as error:
             raise InputError(f"{path}: damaged or truncated photo ({_reason(error)}); copy it again") from error
     return Photo(info, pixels)
-
-
-def read_photos(
-    paths: Sequence[Path], *, max_megapixels: float = MAX_MEGAPIXELS
-) -> tuple[list[Photo], list[PhotoProblem]]:
-    """Decode photos; those that cannot be read are reported and left out.
-
-    Raises:
-        InputError: Not one of them can be read.
-    """
-    photos: list[Photo] = []
-    problems: list[PhotoProblem] = []
-    for path in paths:
-        try:
-            photos.append(read_photo(path, max_megapixels=max_megapixels))
-        except InputError as error:
-            logger.warning("skipped %s", error)
-            problems.append(PhotoProblem(path, str(error)))
-    if paths and not photos:
-        raise InputError(f"none of {len(paths)} photos can be read; the first: {problems[0].reason}")
-    return photos, problems
 
 
 def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 95) -> None:

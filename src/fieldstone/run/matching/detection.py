@@ -14,7 +14,7 @@ from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.features.sift import Sift, reduced_grey
-from fieldstone.io.files.cache import Unit, Workspace, code_version, file_hash, key_of
+from fieldstone.io.files.cache import Unit, UnitCache, code_version, file_hash, key_of
 from fieldstone.io.files.names import name_problem
 from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
 from fieldstone.io.images.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
@@ -51,7 +51,7 @@ class DetectedPhoto:
 def detect(
     paths: Sequence[Path],
     options: MatchingOptions,
-    workspace: Workspace,
+    cache: UnitCache,
     on_progress: OnProgress = silent,
 ) -> tuple[list[DetectedPhoto], list[PhotoProblem]]:
     """Features of every readable photo, in the order of the paths, and the files that are not used.
@@ -67,7 +67,7 @@ def detect(
     progress = StageProgress(on_progress, "finding features", len(paths))
 
     def one(path: Path) -> DetectedPhoto | PhotoProblem:
-        return _detected(path, masks.get(path), extractor, workspace)
+        return _detected(path, masks.get(path), extractor, cache)
 
     # A photo for each thread, until there are fewer photos than threads.
     together = len(paths) - len(paths) % options.threads
@@ -76,20 +76,20 @@ def detect(
     with opencv_threads(options.threads):
         results += list(progress.each(map(one, paths[together:])))
     photos, problems = _without_copies(results)
-    workspace.forget_others(STAGE, [photo.key for photo in photos])
+    cache.forget_others(STAGE, [photo.key for photo in photos])
     check_polarity([photo.kept for photo in photos if photo.info.path in masks])
     return photos, problems
 
 
-def _detected(path: Path, mask: Path | None, extractor: Sift, workspace: Workspace) -> DetectedPhoto | PhotoProblem:
-    """Features of one photo, found in the workspace or in its pixels; or why it is not used."""
+def _detected(path: Path, mask: Path | None, extractor: Sift, cache: UnitCache) -> DetectedPhoto | PhotoProblem:
+    """Features of one photo, found in the cache or in its pixels; or why it is not used."""
     bad_name = name_problem(path.name)
     if bad_name is not None:
         return PhotoProblem(path, f"{bad_name}; rename it", "not used")
     try:
         hashes = [file_hash(path), None if mask is None else file_hash(mask)]
         key = key_of(STAGE, code_version(), cv2.__version__, hashes, extractor.options)
-        unit, info = workspace.find(STAGE, key), read_photo_info(path)
+        unit, info = cache.find(STAGE, key), read_photo_info(path)
     except InputError as error:
         return _unusable(path, error)
     if unit is not None:
@@ -100,7 +100,7 @@ def _detected(path: Path, mask: Path | None, extractor: Sift, workspace: Workspa
     except InputError as error:
         return _unusable(path, error)
     facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
-    workspace.keep(STAGE, key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
+    cache.keep(STAGE, key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
     return DetectedPhoto(info, features, key, mask=mask, **facts)
 
 

@@ -12,7 +12,7 @@ from fieldstone.features.matching import MutualRatio
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.files.cache import Packing, Unit, Workspace, code_version, key_of, resumed
+from fieldstone.io.files.cache import Packing, Unit, UnitCache, code_version, key_of, resumed
 from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.run.matching.detection import DetectedPhoto
 from fieldstone.run.matching.options import MatchingOptions
@@ -23,7 +23,7 @@ def match_pairs(
     photos: Sequence[DetectedPhoto],
     pairs: Sequence[ImagePair],
     options: MatchingOptions,
-    workspace: Workspace,
+    cache: UnitCache,
     on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """Putative matches of the pairs, in their order; pairs without any are left out."""
@@ -38,7 +38,7 @@ def match_pairs(
 
     keys = [key_of(code_version(), photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
     packing = Packing(lambda rows: Unit({"rows": rows}), lambda unit: unit.arrays["rows"])
-    matches = resumed(workspace, "matches", keys, pairs, work, packing)
+    matches = resumed(cache, "matches", keys, pairs, work, packing)
     return MatchGraph(
         tuple(photo.info.path.name for photo in photos),
         tuple(photo.features.keypoints for photo in photos),
@@ -55,7 +55,7 @@ def verify(
     camera_of_image: Int[np.ndarray, "n"],
     options: MatchingOptions,
     seed: int,
-    workspace: Workspace,
+    cache: UnitCache,
     on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """The graph with the geometry of every pair, see `features.verification.verify_pairs`."""
@@ -74,7 +74,7 @@ def verify(
         )
 
     packing = Packing(_pack, _unpack)
-    found = resumed(workspace, "two_views", [key(pair) for pair in pairs], pairs, work, packing)
+    found = resumed(cache, "two_views", [key(pair) for pair in pairs], pairs, work, packing)
     return graph.with_two_views(dict(zip(pairs, found, strict=True)))
 
 

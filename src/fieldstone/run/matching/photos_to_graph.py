@@ -15,8 +15,8 @@ from jaxtyping import Bool, Int
 from fieldstone.errors import InputError
 from fieldstone.features.pairs import choose_pairs
 from fieldstone.geometry.camera import Camera
-from fieldstone.io.course.matching_txt import read_course_folder
-from fieldstone.io.files.cache import Workspace
+from fieldstone.io.files.cache import UnitCache
+from fieldstone.io.given_matches.matching_txt import read_given_matches
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.progress import OnProgress, silent
 from fieldstone.report.figures import PhotoByName
@@ -53,24 +53,24 @@ class MatchedPhotos:
     """What a user should know of how the cameras were found."""
 
 
-def read_course(folder: Path) -> MatchedPhotos:
+def read_matched_photos(folder: Path) -> MatchedPhotos:
     """Given matches and calibration, and the photos for colours and figures where they are there."""
     start = time.perf_counter()
-    course = read_course_folder(folder)
-    camera = course.camera
+    given = read_given_matches(folder)
+    camera = given.camera
     return MatchedPhotos(
-        graph=course.graph,
+        graph=given.graph,
         cameras=(camera,),
-        camera_of_image=np.zeros(course.graph.num_images, dtype=np.int64),
+        camera_of_image=np.zeros(given.graph.num_images, dtype=np.int64),
         known=np.array([True]),
-        photo_of=photos_on_disk([path for path in course.photos if path is not None]),
-        problems=course.problems,
+        photo_of=photos_on_disk([path for path in given.photos if path is not None]),
+        problems=given.problems,
         seconds={"reading": time.perf_counter() - start},
     )
 
 
 def match_photos(
-    folder: Path, options: MatchingOptions, seed: int, workspace: Workspace, on_progress: OnProgress = silent
+    folder: Path, options: MatchingOptions, seed: int, cache: UnitCache, on_progress: OnProgress = silent
 ) -> MatchedPhotos:
     """Features of every photo, matches of every pair, focal lengths where nobody knows them, two-view geometry.
 
@@ -78,7 +78,7 @@ def match_photos(
         InputError: Fewer than two photos can be read.
     """
     stop, seconds = _stopwatch()
-    photos, problems = detect(list_photos(folder), options, workspace, on_progress)
+    photos, problems = detect(list_photos(folder), options, cache, on_progress)
     for problem in problems:
         logger.warning("skipped %r: %s", problem.path.name, problem.reason)
     if len(photos) < 2:
@@ -97,10 +97,10 @@ def match_photos(
         positions=gps_positions(infos),
         threads=options.threads,
     )
-    graph = match_pairs(photos, pairs, options, workspace, on_progress)
+    graph = match_pairs(photos, pairs, options, cache, on_progress)
     stop("matching")
     cameras, notes = vote_on_focal(graph, cameras, camera_of_image, source, options, seed)
-    graph = verify(graph, photos, cameras, camera_of_image, options, seed, workspace, on_progress)
+    graph = verify(graph, photos, cameras, camera_of_image, options, seed, cache, on_progress)
     stop("verification")
     known = np.array([options.fix_intrinsics and s == "given" for s in source])
     photo_of = photos_on_disk([info.path for info in infos])

@@ -1,4 +1,4 @@
-"""Which photos a course folder holds, and which ids its match files know them by."""
+"""Which photos a data set with given matches holds, and which ids its match files know them by."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class CoursePhotos:
-    """The photos of a course folder.
+class GivenPhotos:
+    """The photos of a data set with given matches.
 
     paths: by id, readable photos only, empty if the folder holds none. size: (width, height), None without photos.
     num_images: photos of the whole data set, those that the folder lacks included.
@@ -27,8 +27,8 @@ class CoursePhotos:
     problems: tuple[PhotoProblem, ...]
 
 
-def find_photos(folder: Path, *, last_with_matches: int) -> CoursePhotos:
-    """Photos of a course folder by id: the number that is the file's name, else the place in natural order.
+def find_photos(folder: Path, *, last_with_matches: int) -> GivenPhotos:
+    """Photos of the folder by id: the number that is the file's name, else the place in natural order.
 
     Args:
         last_with_matches: The highest id that the names of the match files imply; the data set has at least as many
@@ -59,7 +59,7 @@ def find_photos(folder: Path, *, last_with_matches: int) -> CoursePhotos:
             "calibration.txt holds one K, so all photos need one size"
         )
     num_images = max(last_with_matches, *by_id) if by_id else last_with_matches
-    return CoursePhotos(paths, next(iter(sizes), None), num_images, tuple(problems))
+    return GivenPhotos(paths, next(iter(sizes), None), num_images, tuple(problems))
 
 
 def _by_id(folder: Path) -> dict[int, Path]:

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, pinhole
-from fieldstone.io.course.photos import CoursePhotos, find_photos
+from fieldstone.io.given_matches.photos import GivenPhotos, find_photos
 from fieldstone.io.images.photos import PhotoProblem
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
@@ -35,8 +35,8 @@ MAX_SKEW = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class CourseFolder:
-    """A course folder as read: the graph and its camera, and what was left out on the way.
+class GivenMatches:
+    """A data set with given matches: the graph and its camera, and what was left out on the way.
 
     photos: the file of each photo of the graph; None where the folder has matches but no photos.
     """
@@ -68,19 +68,13 @@ class _MatchingFile:
     entry_pixels: Float[np.ndarray, "e 2"]
 
 
-def is_course_folder(folder: Path) -> bool:
+def is_given_matches_folder(folder: Path) -> bool:
     """The folder holds match files, so it is meant to be read by this module."""
     return folder.is_dir() and any(MATCHING_NAME.fullmatch(p.name) for p in folder.iterdir())
 
 
-def read_matching_txt(folder: Path) -> tuple[MatchGraph, Camera]:
-    """The match graph of a course folder and the one camera of its photos; see `read_course_folder`."""
-    course = read_course_folder(folder)
-    return course.graph, course.camera
-
-
-def read_course_folder(folder: Path) -> CourseFolder:
-    """Read calibration, photos and matches of a course folder.
+def read_given_matches(folder: Path) -> GivenMatches:
+    """Read calibration, photos and matches of a data set with given matches; pixels in our convention.
 
     A place in a photo is one keypoint, in however many lines and files it appears. Matches that name a photo which
     the folder lacks (or which cannot be decoded) are left out and counted. Without any photo, the ids in the files
@@ -105,25 +99,24 @@ def read_course_folder(folder: Path) -> CourseFolder:
     rows, dropped = _match_rows(files, ids, index)
     num_given = {pair: len(rows[pair]) for pair in sorted(rows)}
     matches = {pair: np.unique(rows[pair], axis=0) for pair in num_given}
-    num_left = sum(len(m) for m in matches.values())
+    num_left, num_dropped = sum(len(m) for m in matches.values()), sum(dropped.values())
     if dropped:
         logger.warning(
             "%s: dropped %d of %d matches, their photos are missing: %s",
             folder,
-            sum(dropped.values()),
-            sum(dropped.values()) + sum(num_given.values()),
+            num_dropped,
+            num_dropped + sum(num_given.values()),
             ", ".join(f"photo {i} ({n} matches)" for i, n in sorted(dropped.items())),
         )
     if not num_left:
-        given = sum(dropped.values())
-        raise InputError(f"{folder}: none of its {given} matches joins two photos of the folder; add the photos")
+        raise InputError(f"{folder}: none of its {num_dropped} matches joins two photos of the folder; add the photos")
     logger.info("read %d matches of %d pairs of %d photos from %s", num_left, len(matches), len(ids), folder)
     names = tuple(photos.paths[i].name if photos.paths else f"{i}.png" for i in ids)
     camera = pinhole(*(photos.size or _size_from_contents(K, keypoints)), K)
     paths = tuple(photos.paths.get(i) for i in ids)
     graph = MatchGraph(names, keypoints, colors, matches)
     num_repeated = sum(num_given.values()) - num_left
-    return CourseFolder(graph, camera, paths, num_given, num_repeated, dropped, photos.problems)
+    return GivenMatches(graph, camera, paths, num_given, num_repeated, dropped, photos.problems)
 
 
 def read_calibration(path: Path) -> Float[np.ndarray, "3 3"]:
@@ -244,7 +237,7 @@ def _parse_numbers(path: Path, tokens: list[list[str]], first_line: int) -> Floa
     return np.array([_finite(token, path, line) for line, row in enumerate(tokens, first_line) for token in row])
 
 
-def _check_against_photos(file: _MatchingFile, photos: CoursePhotos) -> None:
+def _check_against_photos(file: _MatchingFile, photos: GivenPhotos) -> None:
     """Ids belong to the data set, and places lie inside the photos."""
     line = file.line[file.entry_row]
     beyond = file.entry_image > photos.num_images
@@ -319,7 +312,7 @@ def _size_from_contents(K: Float[np.ndarray, "3 3"], keypoints: tuple[np.ndarray
 def _read_lines(path: Path) -> list[str]:
     """Lines of a text file with any line ends."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; a course folder needs calibration.txt and matching*.txt")
+        raise InputError(f"{path}: no such file; a data set with given matches needs calibration.txt and matching*.txt")
     try:
         return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     except UnicodeDecodeError as error:

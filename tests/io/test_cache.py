@@ -7,7 +7,7 @@ import pytest
 
 from fieldstone.features.sift import SiftOptions
 from fieldstone.io.files import cache as module
-from fieldstone.io.files.cache import Packing, Unit, Workspace, file_hash, key_of, resumed
+from fieldstone.io.files.cache import Packing, Unit, UnitCache, file_hash, key_of, resumed
 
 PACKING = Packing(lambda value: Unit({"value": value}, {"size": len(value)}), lambda unit: unit.arrays["value"])
 
@@ -24,8 +24,8 @@ class Counting:
             yield np.arange(item) ** 2
 
 
-def run(workspace: Workspace, items: list[int], work: Counting) -> list[np.ndarray]:
-    return resumed(workspace, "squares", [key_of("square", item) for item in items], items, work, PACKING)
+def run(cache: UnitCache, items: list[int], work: Counting) -> list[np.ndarray]:
+    return resumed(cache, "squares", [key_of("square", item) for item in items], items, work, PACKING)
 
 
 def test_a_unit_comes_back_bit_for_bit(tmp_path):
@@ -34,44 +34,44 @@ def test_a_unit_comes_back_bit_for_bit(tmp_path):
         "empty": np.empty((0, 2), dtype=np.int64),
         "mask": np.array([True, False, True]),
     }
-    workspace = Workspace(tmp_path)
-    workspace.keep("stage", "key", Unit(arrays, {"kind": "planar", "number": 0.1}))
-    unit = workspace.find("stage", "key")
+    cache = UnitCache(tmp_path)
+    cache.keep("stage", "key", Unit(arrays, {"kind": "planar", "number": 0.1}))
+    unit = cache.find("stage", "key")
     assert unit is not None
     assert unit.facts == {"kind": "planar", "number": 0.1}
     for name, array in arrays.items():
         assert unit.arrays[name].dtype == array.dtype
         assert unit.arrays[name].flags.writeable
         np.testing.assert_array_equal(unit.arrays[name], array, strict=True)
-    assert workspace.find("stage", "other") is None
-    assert workspace.find("other", "key") is None
+    assert cache.find("stage", "other") is None
+    assert cache.find("other", "key") is None
 
 
 def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     work = Counting()
-    run(Workspace(), [3, 4], work)
-    run(Workspace(), [3, 4], work)
+    run(UnitCache(), [3, 4], work)
+    run(UnitCache(), [3, 4], work)
     assert work.seen == [3, 4, 3, 4]
     assert not list(tmp_path.iterdir())
 
 
 def test_only_what_is_missing_is_done(tmp_path):
-    workspace, work = Workspace(tmp_path), Counting()
-    run(workspace, [3, 4, 5], work)
-    values = run(workspace, [5, 6, 3], work)
+    cache, work = UnitCache(tmp_path), Counting()
+    run(cache, [3, 4, 5], work)
+    values = run(cache, [5, 6, 3], work)
     assert work.seen == [3, 4, 5, 6]
     for value, size in zip(values, [5, 6, 3], strict=True):
         np.testing.assert_array_equal(value, np.arange(size) ** 2)
     # What does not belong to the last run is gone, and the rest lies in one file.
-    assert set(workspace.find_all("squares")) == {key_of("square", k) for k in (5, 6, 3)}
+    assert set(cache.find_all("squares")) == {key_of("square", k) for k in (5, 6, 3)}
     assert len(list((tmp_path / "squares").iterdir())) == 1
 
 
 @pytest.mark.parametrize("stopped_at", [0, 1, 4, 5, 9, 10])
 def test_a_stopped_stage_loses_at_most_one_batch(tmp_path, monkeypatch, stopped_at):
     monkeypatch.setattr(module, "BATCH", 4)
-    workspace, work = Workspace(tmp_path), Counting()
+    cache, work = UnitCache(tmp_path), Counting()
     items = list(range(1, 11))
 
     def stopping(some: Sequence[int]) -> Iterator[np.ndarray]:
@@ -83,10 +83,10 @@ def test_a_stopped_stage_loses_at_most_one_batch(tmp_path, monkeypatch, stopped_
     keys = [key_of("square", item) for item in items]
     if stopped_at < len(items):
         with pytest.raises(KeyboardInterrupt):
-            resumed(workspace, "squares", keys, items, stopping, PACKING)
-    assert len(workspace.find_all("squares")) == (stopped_at // 4 * 4 if stopped_at < 10 else 0)
+            resumed(cache, "squares", keys, items, stopping, PACKING)
+    assert len(cache.find_all("squares")) == (stopped_at // 4 * 4 if stopped_at < 10 else 0)
     again = Counting()
-    values = run(workspace, items, again)
+    values = run(cache, items, again)
     assert again.seen == items[stopped_at // 4 * 4 if stopped_at < 10 else 0 :]
     for value, size in zip(values, items, strict=True):
         np.testing.assert_array_equal(value, np.arange(size) ** 2)
@@ -94,8 +94,8 @@ def test_a_stopped_stage_loses_at_most_one_batch(tmp_path, monkeypatch, stopped_
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "another file", "header"])
 def test_damaged_files_are_made_anew(tmp_path, damage):
-    workspace, work = Workspace(tmp_path), Counting()
-    run(workspace, [300, 400], work)
+    cache, work = UnitCache(tmp_path), Counting()
+    run(cache, [300, 400], work)
     (path,) = (tmp_path / "squares").iterdir()
     data = bytearray(path.read_bytes())
     match damage:
@@ -110,10 +110,10 @@ def test_damaged_files_are_made_anew(tmp_path, damage):
         case "header":
             data[3] ^= 0xFF
     path.write_bytes(bytes(data))
-    values = run(workspace, [300, 400], work)
+    values = run(cache, [300, 400], work)
     assert work.seen == [300, 400, 300, 400]
     np.testing.assert_array_equal(values[1], np.arange(400) ** 2)
-    assert set(workspace.find_all("squares")) == {key_of("square", 300), key_of("square", 400)}
+    assert set(cache.find_all("squares")) == {key_of("square", 300), key_of("square", 400)}
 
 
 def test_keys_follow_content():
