@@ -173,7 +173,14 @@ def read_photo(path: Path, *, at_least_px: int | None = None, max_megapixels: fl
 
 
 def write_photo(path: Path, rgb: UInt8[np.ndarray, "h w c"], *, quality: int = 95) -> None:
-    """Write RGB or RGBA pixels, format by suffix, whole or not at all; `quality` is for JPEG and WebP."""
+    """Write sRGB or RGBA pixels (straight alpha), format by suffix, whole or not at all.
+
+    Args:
+        quality: Of JPEG and WebP, 1 to 100; PNG and TIFF are exact.
+
+    Raises:
+        ValueError: A suffix that Pillow does not write.
+    """
     with replacing(path) as temporary:
         Image.fromarray(rgb).save(temporary, quality=quality)
 

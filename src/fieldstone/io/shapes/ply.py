@@ -69,7 +69,7 @@ class _Element:
 
 
 def read_points(path: Path) -> Points:
-    """The vertices of a PLY file (ASCII, little or big endian); other elements and properties are passed over.
+    """The vertices of a PLY file (ASCII, little or big endian), coordinates as they stand; the rest is passed over.
 
     Colours: `red green blue` or `diffuse_red ...`, 8 or 16 bits or floats; grey where there are none.
 
@@ -88,7 +88,7 @@ def read_points(path: Path) -> Points:
 
 
 def write_points(points: Points, path: Path) -> None:
-    """Write points and colours, binary little endian, double precision, whole or not at all."""
+    """Write world points and sRGB colours, binary little endian, double precision, whole or not at all."""
     header = ["ply", "format binary_little_endian 1.0", "comment written by fieldstone"]
     header += [f"element vertex {len(points)}"]
     header += [f"property double {axis}" for axis in "xyz"]

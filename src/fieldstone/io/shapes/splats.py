@@ -34,7 +34,7 @@ PROPERTIES = (
 
 
 def write_splats(splats: Splats, path: Path) -> None:
-    """Write splats, whole or not at all.
+    """Write splats in the world as PLY with the properties of the original program, whole or not at all.
 
     Raises:
         InputError: There are none.
