@@ -172,24 +172,20 @@ def _tables_from_reconstruction(
     registered = model.registered().tolist()
     if not registered:
         raise ValueError("no view is registered: there is no model to write")
-    if not np.isin(observations.view, registered).all():
-        raise ValueError("an observation belongs to a view that is not registered")
-    written_keypoint = np.empty(len(observations), dtype=np.int64)
+    among_observed = model.keypoints_among_observed()
+    written_keypoint = among_observed if keypoints is None else observations.keypoint
     images = []
     for v in registered:
         view = model.views[v]
         if problem := name_problem(view.name):
             raise InputError(f"view {v}: {problem}")
         rows = np.flatnonzero(observations.view == v)
-        used, place = np.unique(observations.keypoint[rows], return_inverse=True)
-        if len(used) < len(rows):
-            raise ValueError(f"a keypoint of {view.name} shows two points")
+        place = written_keypoint[rows]
         if keypoints is None:
             pixels = np.empty((len(rows), 2))
             pixels[place] = observations.pixels[rows]
         else:
-            pixels, place = keypoints[v], observations.keypoint[rows]
-        written_keypoint[rows] = place
+            pixels = keypoints[v]
         point_id = np.full(len(pixels), NO_POINT, dtype=np.int64)
         point_id[place] = observations.point[rows] + 1
         images.append(ColmapImage(v + 1, view.camera + 1, view.name, model.pose_of(v), pixels, point_id))
