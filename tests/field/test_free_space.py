@@ -93,7 +93,7 @@ def test_what_too_few_photos_see_from_near_is_not_there():
     """A ninth photo that looks elsewhere: nothing stands where it alone sees near places."""
     photos, seen = wall_scene(9)
     aside = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    photos = photos.at_poses(Rigid3.stack([*(photos.pose_of(v) for v in range(8)), aside]))
+    photos = replace(photos, cam_from_world=Rigid3.stack([*(photos.pose_of(v) for v in range(8)), aside]))
     seen[8] = SeenPoints(aside.inverse().apply(seen[0].xyz), seen[0].sigma)
     start = box()
     carved = carve_free_space(start, photos, FRAME, seen, contracted_space(), WORKER)

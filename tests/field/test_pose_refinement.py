@@ -118,7 +118,7 @@ def test_training_moves_photos_and_goes_on_from_a_checkpoint_to_the_same_bytes()
     photos = ball_photos()
     tangents = np.zeros((len(photos), 6))
     tangents[2] = [0.0, 0.02, 0.0, 0.0, 0.0, 0.02]
-    photos = replace(photos, posed=photos.posed.at_poses(photos.posed.cam_from_world.retract(tangents)))
+    photos = replace(photos, posed=replace(photos.posed, cam_from_world=photos.posed.cam_from_world.retract(tangents)))
     plan = plan_of(
         finest=24, steps=(10, 15, 15, 15, 10, 5, 5, 5), num_chunks=2, samples_per_chunk=512, refine_poses=True
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +84,3 @@ class FieldMetrics:
     """Whether the transparency of photos was used; None for the classical networks."""
     plan: Mapping[str, Any] | None = None
     """The plan that the grid field followed."""
-
-
-Curve = Sequence[CurvePoint]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -77,10 +77,6 @@ class PosedPhotos:
             paths=None if self.paths is None else [self.paths[i] for i in rows],
             masks=None if self.masks is None else [self.masks[i] for i in rows],
         )
-
-    def at_poses(self, cam_from_world: Rigid3) -> PosedPhotos:
-        """The same photos at other poses."""
-        return replace(self, cam_from_world=cam_from_world)
 
 
 def posed_photos(

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
@@ -256,8 +257,8 @@ def write_photos(photos: SyntheticPhotos, folder: Path, options: PhotoOptions, *
     paths = []
     for view, image in zip(photos.truth.views, photos.images, strict=True):
         exif = Image.Exif()
-        exif[0x010F], exif[0x0110] = "fieldstone", "synthetic house"
-        exif.get_ifd(0x8769)[0xA405] = options.focal_35mm
+        exif[Base.Make], exif[Base.Model] = "fieldstone", "synthetic house"
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = options.focal_35mm
         path = folder / view.name
         Image.fromarray(image).save(path, quality=quality, subsampling=0, exif=exif)
         paths.append(path)
