@@ -150,8 +150,8 @@ def test_options_that_make_no_sense_are_named(photos):
         fs.train(photos, budget_s=-1.0)
     with pytest.raises(fs.InputError, match="`plan` belongs to the fast field"):
         fs.train(photos, field="tiny", plan=Path("plan.json"))
-    with pytest.raises(TypeError, match="sise"):
-        fs.train(photos, sise=3)
+    with pytest.raises(TypeError, match="sizes"):
+        fs.train(photos, sizes=3)
 
 
 def test_nothing_is_loaded_before_it_is_used():
