@@ -110,7 +110,7 @@ def set_entry(row: int, column: int, number: float):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (set_entry(0, 3, float("nan")), r"frame 1 \(train/r_1\): transform_matrix is not finite"),
+        (set_entry(0, 3, float("nan")), r"frame 1 \(train/r_1\): transform_matrix is no camera pose: it is not finite"),
         (set_entry(0, 0, 5.0), r"frame 1 \(train/r_1\): .* not orthonormal"),
         (set_entry(0, 0, 1e300), r"frame 1 \(train/r_1\): .* not orthonormal"),
         (set_entry(3, 3, 2.0), r"frame 1 \(train/r_1\): .* last row"),

@@ -218,7 +218,7 @@ def test_photos_without_numbers_count_in_natural_order(tmp_path):
         (lambda f: (f / "01.png").write_bytes(b""), "are both photo 1"),
         (lambda f: write_photo(f / "3.png", np.zeros((4, 4, 3), dtype=np.uint8)), "all photos need one size"),
         (lambda f: [p.write_bytes(b"") for p in f.glob("*.png")], "none of 4 photos can be read"),
-        (lambda f: (f / "matching2.txt").write_bytes(b"\xff\xfe\x00"), "not a text file"),
+        (lambda f: (f / "matching2.txt").write_bytes(b"\xff\xfe\x00"), "not UTF-8 text"),
     ],
 )
 def test_folders_that_cannot_be_used_say_why(tmp_path, change, message):

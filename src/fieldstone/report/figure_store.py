@@ -6,19 +6,19 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.io.files.atomic import write_bytes, write_json, write_text
+from fieldstone.io.files.others import read_json
 from fieldstone.report.raster import encode_jpeg
 from fieldstone.report.theme import DARK, LIGHT, LIGHTBOX, Theme
 
@@ -136,20 +136,6 @@ def read_index(folder: Path) -> FigureIndex:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: not an index of figures ({error}); remove the folder and run again") from error
     return index
-
-
-def read_json(path: Path) -> Any:
-    """What a JSON file holds.
-
-    Raises:
-        InputError: Not readable, not UTF-8, or not JSON; with the line.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); run the command again") from error
-    except (OSError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run the command again") from error
 
 
 def _files(index: FigureIndex) -> set[str]:

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int, UInt8
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera, pinhole
+from fieldstone.io.files.others import finite_word, finite_words, read_text
 from fieldstone.io.given_matches.photos import GivenPhotos, find_photos
 from fieldstone.io.images.photos import PhotoProblem
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
@@ -131,7 +132,7 @@ def read_calibration(path: Path) -> Float[np.ndarray, "3 3"]:
         content = re.sub(r"[%#].*", "", text)
         content = re.sub(r"^\s*[A-Za-z]\w*\s*=", " ", content)
         for token in re.sub(r"[\[\];,]", " ", content).split():
-            numbers.append((_finite(token, path, line), line))
+            numbers.append((finite_word(token, f"{path}, line {line}"), line))
     if len(numbers) != 9:
         _refuse(path, numbers[-1][1] if numbers else 1, f"a 3x3 matrix K has 9 numbers, found {len(numbers)}")
     K = np.array([value for value, _ in numbers]).reshape(3, 3)
@@ -175,7 +176,7 @@ def _read_matching_file(path: Path, image: int) -> _MatchingFile:
     length = np.array([len(t) for t in tokens], dtype=np.int64)
     line = np.flatnonzero(length) + first + 2
     length = length[length > 0]
-    values = _parse_numbers(path, tokens, first + 2)
+    values = finite_words(path, tokens, range(first + 2, first + 2 + len(tokens)))
     start = np.cumsum(length) - length
 
     _check_rows(path, line, length < 6, "a feature needs at least 6 numbers: count, R G B, u v")
@@ -222,19 +223,6 @@ def _feature_count(path: Path, line: int, text: str) -> int:
     if not re.fullmatch(r"\d{1,12}", header[1], re.ASCII):
         _refuse(path, line, f"nFeatures must be a whole number, got {header[1][:40]!r}; correct the count")
     return int(header[1])
-
-
-def _parse_numbers(path: Path, tokens: list[list[str]], first_line: int) -> Float[np.ndarray, "t"]:
-    """All tokens as numbers in one go; the line of a bad one is only searched for if there is one."""
-    flat = [token for row in tokens for token in row]
-    try:
-        values = np.array([float(token) for token in flat])
-    except ValueError:
-        values = np.array([np.nan])
-    # Python reads 1_000 as a number; files do not mean it.
-    if np.isfinite(values).all() and "_" not in "".join(flat):
-        return values
-    return np.array([_finite(token, path, line) for line, row in enumerate(tokens, first_line) for token in row])
 
 
 def _check_against_photos(file: _MatchingFile, photos: GivenPhotos) -> None:
@@ -313,17 +301,7 @@ def _read_lines(path: Path) -> list[str]:
     """Lines of a text file with any line ends."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; a data set with given matches needs calibration.txt and matching*.txt")
-    try:
-        return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}, byte {error.start}: not a text file; copy it again") from error
-
-
-def _finite(token: str, path: Path, line: int) -> float:
-    is_number = re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", token, re.ASCII)
-    if not is_number or not np.isfinite(float(token)):
-        _refuse(path, line, f"{token[:40]!r} is not a finite number; correct or remove the line")
-    return float(token)
+    return read_text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def _check_rows(path: Path, line: Int[np.ndarray, "n"], wrong: np.ndarray, why: str) -> None:

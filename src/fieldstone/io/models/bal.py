@@ -20,6 +20,7 @@ from fieldstone.geometry import rotation
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.opengl import CV_FROM_GL
 from fieldstone.geometry.rigid3 import Rigid3
+from fieldstone.io.files.others import finite_words, is_finite_word
 from fieldstone.solve.bundle.problem import BundleProblem
 
 CAM_FROM_BAL_CAM = CV_FROM_GL
@@ -162,25 +163,9 @@ def _read_observations(path: Path, lines: list[Line]) -> Float[np.ndarray, "o 4"
 def _is_observation(text: str) -> bool:
     """Two indices and two finite numbers."""
     fields = text.split()
-    return len(fields) == 4 and all(f.isdecimal() for f in fields[:2]) and all(_is_finite(f) for f in fields[2:])
-
-
-def _is_finite(field: str) -> bool:
-    """Whether python reads the field as a finite number."""
-    try:
-        return bool(np.isfinite(float(field)))
-    except ValueError:
-        return False
+    return len(fields) == 4 and all(f.isdecimal() for f in fields[:2]) and all(is_finite_word(f) for f in fields[2:])
 
 
 def _read_values(path: Path, lines: list[Line]) -> Float[np.ndarray, "n"]:
     """Camera and point parameters, any number of them per line."""
-    fields = " ".join(line.text for line in lines).split()
-    try:
-        values = np.array(fields, dtype=np.float64)
-    except ValueError:
-        values = np.full(1, np.nan)
-    if not np.all(np.isfinite(values)):
-        number, text = next(line for line in lines if not all(_is_finite(f) for f in line.text.split()))
-        raise InputError(f"{path}, line {number}: expected finite numbers, got {text[:60]!r}: the file is damaged")
-    return values
+    return finite_words(path, [line.text.split() for line in lines], [line.number for line in lines])

@@ -17,6 +17,7 @@ import numpy as np
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rotation import to_wxyz
+from fieldstone.io.files.others import read_text
 from fieldstone.io.models.colmap_tables import ColmapImage, ColmapTables, make_camera, make_image
 
 MAX_ID = 2**63 - 1
@@ -124,10 +125,7 @@ def _read_points(path: Path, cameras: dict[int, Camera], images: list[ColmapImag
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n").split("\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}, byte {error.start}: not a UTF-8 text file") from error
+    return read_text(path).replace("\r\n", "\n").split("\n")
 
 
 def _records(path: Path) -> list[tuple[int, str]]:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Mapping
@@ -15,13 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.io.files.names import name_problem
+from fieldstone.io.files.others import camera_pose, finite_number, read_json
 from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoProblem, read_photo_info
 from fieldstone.io.posed.posed_scene import PosedScene
 from fieldstone.scene.photos import posed_photos
@@ -29,9 +28,6 @@ from fieldstone.scene.photos import posed_photos
 logger = logging.getLogger(__name__)
 
 SPLITS = ("train", "val", "test")
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
-MAX_DEVIATION = 1e-3
-"""Of R^T R from the identity; files hold float32, which is far better."""
 NEAR, FAR = 2.0, 6.0
 """Range of the rays of these scenes, in scene units: objects within 1.5 of the origin, cameras 4 away."""
 
@@ -70,7 +66,7 @@ def read_blender(folder: Path) -> PosedScene:
     """
     if not is_blender_folder(folder):
         raise InputError(f"{folder / 'transforms_train.json'}: no such file; give a folder in the Blender format")
-    described = {s: _read_json(p, folder) for s in SPLITS if (p := folder / f"transforms_{s}.json").is_file()}
+    described = {s: _described(p, folder) for s in SPLITS if (p := folder / f"transforms_{s}.json").is_file()}
     frames: list[_Frame] = []
     splits: dict[str, Int[np.ndarray, "_"]] = {}
     sizes: dict[tuple[int, int], _Frame] = {}
@@ -133,28 +129,21 @@ def _camera(described: Mapping[str, _Split], width: int, height: int) -> Camera:
     return Camera("SIMPLE_PINHOLE", width, height, np.array([focal, 0.5 * width, 0.5 * height]))
 
 
-def _read_json(path: Path, folder: Path) -> _Split:
+def _described(path: Path, folder: Path) -> _Split:
     """Field of view and frames of one file."""
-    try:
-        value = json.loads(path.read_bytes().decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}, byte {error.start}: not UTF-8 text; copy it again") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); copy it again") from error
-    except (RecursionError, ValueError) as error:
-        raise InputError(f"{path}: not valid JSON (nested too deeply, or a number too long)") from error
+    value = read_json(path)
     if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
         raise InputError(f"{path}: no list `frames`; is it in the Blender format?")
-    angle = value.get("camera_angle_x")
-    if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < math.pi:
-        raise InputError(f"{path}: camera_angle_x must be an angle between 0 and pi radians, got {_short(angle)}")
+    angle = finite_number(value.get("camera_angle_x"), f"{path}: camera_angle_x")
+    if not 0 < angle < math.pi:
+        raise InputError(f"{path}: camera_angle_x must be an angle between 0 and pi radians, got {angle:g}")
     frames = tuple(_frame(path, folder, k, entry) for k, entry in enumerate(value["frames"]))
     seen: dict[str, int] = {}
     for k, frame in enumerate(frames):
         if frame.name in seen:
             raise InputError(f"{path}: frames {seen[frame.name]} and {k} are both named {frame.name}; remove one")
         seen[frame.name] = k
-    return _Split(path, float(angle), frames)
+    return _Split(path, angle, frames)
 
 
 def _frame(path: Path, folder: Path, index: int, entry: Any) -> _Frame:
@@ -167,35 +156,5 @@ def _frame(path: Path, folder: Path, index: int, entry: Any) -> _Frame:
     image = folder / relative
     if image.suffix.lower() not in PHOTO_SUFFIXES:
         image = image.with_name(image.name + ".png")
-    return _Frame(image.stem, image, _pose(f"{path}, frame {index} ({relative})", entry.get("transform_matrix")))
-
-
-def _pose(where: str, value: Any) -> Rigid3:
-    """`cam_from_world` with our axes from a world_from_camera matrix with OpenGL axes."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{where}: transform_matrix is no matrix of numbers") from error
-    if matrix.shape != (4, 4):
-        raise InputError(f"{where}: transform_matrix must be 4x4, got shape {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where}: transform_matrix is not finite; remove the frame")
-    if problem := _rigid_problem(matrix):
-        raise InputError(f"{where}: transform_matrix is no rigid motion ({problem})")
-    world_from_cam = Rigid3(nearest_rotation(matrix[:3, :3]) @ CV_FROM_GL, matrix[:3, 3])
-    return world_from_cam.inverse()
-
-
-def _rigid_problem(matrix: Float[np.ndarray, "4 4"]) -> str | None:
-    R = matrix[:3, :3]
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > MAX_DEVIATION:
-        return f"its last row is {matrix[3].tolist()}"
-    if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > MAX_DEVIATION:
-        return "its columns are not orthonormal"
-    if np.linalg.det(R) < 0:
-        return "it mirrors"
-    return None
-
-
-def _short(value: Any) -> str:
-    return repr(value)[:40]
+    where = f"{path}, frame {index} ({relative}): transform_matrix"
+    return _Frame(image.stem, image, camera_pose(entry.get("transform_matrix"), where))

@@ -6,14 +6,11 @@ the intrinsics of the photos.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-
-import numpy as np
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.io.posed.posed_scene import rigid_from_gl
+from fieldstone.io.files.others import camera_pose, read_json
 
 LISTS = {"frames": "transform_matrix", "camera_path": "camera_to_world"}
 """Where the poses stand, and the name of the matrix of each."""
@@ -27,12 +24,9 @@ def read_camera_path(path: Path) -> Rigid3:
     Raises:
         InputError: No such file, or it holds no poses; the message names the first wrong one.
     """
-    try:
-        top = json.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give orbit, spiral, or a JSON file") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON ({error}); copy it again") from error
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read (no such file); give orbit, spiral, or a JSON file")
+    top = read_json(path)
     name = next((name for name in LISTS if isinstance(top, dict) and isinstance(top.get(name), list)), None)
     if name is None or not top[name]:
         raise InputError(f"{path}: no poses; a camera path has a list `frames` or `camera_path` with at least one")
@@ -40,11 +34,7 @@ def read_camera_path(path: Path) -> Rigid3:
         raise InputError(f"{path}: {len(top[name])} poses are more than {MAX_POSES}; split the path")
     poses = []
     for k, entry in enumerate(top[name]):
-        try:
-            matrix = np.array(entry[LISTS[name]], dtype=np.float64)
-            poses.append(rigid_from_gl(matrix.reshape(4, 4) if matrix.shape == (16,) else matrix))
-        except KeyError as error:
-            raise InputError(f"{path}, {name} {k}: no {LISTS[name]}") from error
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{path}, {name} {k}: {LISTS[name]} is no camera pose: {error}") from error
+        if not isinstance(entry, dict) or LISTS[name] not in entry:
+            raise InputError(f"{path}: {name}[{k}] has no {LISTS[name]}; correct or remove it")
+        poses.append(camera_pose(entry[LISTS[name]], f"{path}: {name}[{k}].{LISTS[name]}"))
     return Rigid3.stack(poses)

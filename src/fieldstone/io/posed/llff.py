@@ -12,10 +12,11 @@ import numpy as np
 
 from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.opengl import MAX_DEVIATION
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.io.images.photos import PHOTO_SUFFIXES, read_photo_info
-from fieldstone.io.posed.posed_scene import MAX_DEVIATION, PosedScene
+from fieldstone.io.posed.posed_scene import PosedScene
 from fieldstone.scene.photos import posed_photos, shared_cameras
 
 FILE = "poses_bounds.npy"

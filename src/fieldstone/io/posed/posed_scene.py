@@ -8,16 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.geometry.rotation import nearest_rotation
 from fieldstone.io.images.photos import PhotoProblem
 from fieldstone.scene.photos import PosedPhotos
 from fieldstone.scene.reconstruction import Reconstruction
-
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
-
-MAX_DEVIATION = 1e-3
-"""Of R^T R from the identity; files hold float32, which is far better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,23 +40,3 @@ class PosedScene:
 
 
 NO_PHOTO = np.empty(0, dtype=np.int64)
-
-
-def rigid_from_gl(matrix: np.ndarray) -> Rigid3:
-    """`cam_from_world` with our axes of a world_from_camera matrix with OpenGL axes (x right, y up, looking along -z).
-
-    Raises:
-        ValueError: Not a finite rigid motion; the message says what is wrong.
-    """
-    if matrix.shape != (4, 4):
-        raise ValueError(f"it must be 4x4, got shape {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise ValueError("it is not finite")
-    R = matrix[:3, :3]
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > MAX_DEVIATION:
-        raise ValueError(f"its last row is {matrix[3].tolist()}")
-    if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > MAX_DEVIATION:
-        raise ValueError("its columns are not orthonormal")
-    if np.linalg.det(R) < 0:
-        raise ValueError("it mirrors")
-    return Rigid3(nearest_rotation(R) @ CV_FROM_GL, matrix[:3, 3]).inverse()

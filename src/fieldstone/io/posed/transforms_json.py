@@ -7,7 +7,6 @@ it came from and changes nothing, because `ply_file_path` is in the same world. 
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -21,8 +20,9 @@ from fieldstone.errors import InputError
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.io.files.names import name_problem
+from fieldstone.io.files.others import camera_pose, finite_number, read_json
 from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoProblem, natural_key, read_photo_info
-from fieldstone.io.posed.posed_scene import PosedScene, rigid_from_gl
+from fieldstone.io.posed.posed_scene import PosedScene
 from fieldstone.io.shapes.ply import read_points
 from fieldstone.scene.photos import posed_photos, shared_cameras
 
@@ -52,7 +52,7 @@ def read_transforms(path: Path) -> PosedScene:
         InputError: Not such a file, a pose or an intrinsic is missing or impossible (the message names the frame), or
             no image is there.
     """
-    top = _read_json(path)
+    top = _top_of(path)
     frames, missing = _frames(path, top)
     if missing:
         logger.warning("%s: %d of %d images are missing: %s", path, len(missing), len(top["frames"]), missing[0])
@@ -101,15 +101,15 @@ def _frames(path: Path, top: Mapping[str, Any]) -> tuple[list[_Frame], list[str]
         if name in frames:
             raise InputError(f"{where}: the image {name} was named before; remove one of the two frames")
         camera, mask = _camera(where, {**top, **entry}, image), _mask_path(where, path.parent, entry)
-        frames[name] = _Frame(name, file_path, image, mask, camera, _pose(where, entry))
+        frames[name] = _Frame(
+            name,
+            file_path,
+            image,
+            mask,
+            camera,
+            camera_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"),
+        )
     return list(frames.values()), missing
-
-
-def _pose(where: str, entry: Mapping[str, Any]) -> Rigid3:
-    try:
-        return rigid_from_gl(np.array(entry.get("transform_matrix"), dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: transform_matrix is no camera pose: {error}") from error
 
 
 def _points(path: Path, top: Mapping[str, Any]) -> Float[np.ndarray, "p 3"]:
@@ -123,25 +123,11 @@ def _points(path: Path, top: Mapping[str, Any]) -> Float[np.ndarray, "p 3"]:
     return np.empty((0, 3))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(_without_comments(path.read_bytes().decode("utf-8-sig")))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}, byte {error.start}: not UTF-8 text; copy it again") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); copy it again") from error
-    except (RecursionError, ValueError) as error:
-        raise InputError(f"{path}: not valid JSON (nested too deeply, or a number too long)") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+def _top_of(path: Path) -> dict[str, Any]:
+    value = read_json(path, comments=True)  # instant-ngp accepts them
     if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
         raise InputError(f"{path}: no list `frames`; is it a transforms.json?")
     return value
-
-
-def _without_comments(text: str) -> str:
-    """The text without lines that only hold a // comment, which instant-ngp accepts."""
-    return "\n".join("" if line.lstrip().startswith("//") else line for line in text.split("\n"))
 
 
 def _image_path(where: str, folder: Path, file_path: str) -> Path | None:
@@ -223,11 +209,7 @@ def _distortion(where: str, given: Mapping[str, Any]) -> tuple[str, tuple[float,
 
 def _number(where: str, given: Mapping[str, Any], name: str, default: float | None) -> Any:
     value = given.get(name, default)
-    if value is default:
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {name} must be a finite number, got {value!r}")
-    return float(value)
+    return value if value is default else finite_number(value, f"{where}: {name}")
 
 
 def _splits(path: Path, top: Mapping[str, Any], file_paths: Sequence[str]) -> dict[str, Int[np.ndarray, "_"]]:
