@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,3 +16,19 @@ def torch_runs_in_one_thread() -> None:
     """
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def house_photos(tmp_path_factory) -> Path:
+    """Six photos, 320 x 240, of which every mapper makes one model. Copy them before changing them."""
+    import numpy as np
+
+    from fieldstone.synthetic.photos import PhotoOptions, make_photos, write_photos
+
+    options = PhotoOptions(num_photos=6, width=320, height=240, arc_deg=60.0, samples_per_axis=1, texel=0.03)
+    folder = tmp_path_factory.mktemp("house")
+    write_photos(make_photos(options, np.random.default_rng(0)), folder, options)
+    for path in folder.iterdir():
+        if path.suffix != ".jpg":
+            path.unlink()
+    return folder

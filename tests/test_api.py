@@ -22,17 +22,9 @@ def python_of_readme() -> str:
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> Path:
+def photos(house_photos) -> Path:
     """Six photos of a house, 320 x 240."""
-    from fieldstone.synthetic.photos import PhotoOptions, make_photos, write_photos
-
-    folder = tmp_path_factory.mktemp("api") / "photos"
-    options = PhotoOptions(num_photos=6, width=320, height=240, arc_deg=60.0, samples_per_axis=1, texel=0.03)
-    write_photos(make_photos(options, np.random.default_rng(0)), folder, options)
-    for path in folder.iterdir():
-        if path.suffix != ".jpg":
-            path.unlink()
-    return folder
+    return house_photos
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +41,15 @@ def scene(photos, events) -> fs.Scene:
 
 @pytest.fixture(scope="module")
 def field(scene) -> fs.Field:
-    """Of the scene, in memory: as good as three seconds allow."""
-    return fs.train(scene, budget_s=3, hold_out=("house_02.jpg",))
+    """Of the scene, in memory: as good as one second allows."""
+    return fs.train(scene, budget_s=1, hold_out=("house_02.jpg",))
 
 
 def test_the_lines_of_the_readme_run(photos, tmp_path, monkeypatch):
     shutil.copytree(photos, tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
-    code = python_of_readme().replace("budget_s=60", "budget_s=3")
-    assert code.count("budget_s=3") == 1
+    code = python_of_readme().replace("budget_s=60", "budget_s=1")
+    assert code.count("budget_s=1") == 1
     names: dict = {}
     exec(compile(code, "README.md", "exec"), names)
     assert names["scene"].summary.registered == 6

@@ -265,7 +265,9 @@ def test_depths_run_along_each_ray_on_its_own():
     assert total.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene", ["alpha", "around", *(pytest.param(scene, marks=pytest.mark.slow) for scene in ("no alpha", "forward"))]
+)
 def test_it_learns_as_well_as_the_kernels(scene):
     """The same plan, through all stages: the loss falls as far, and a photo that was left out is met as well."""
     with ThreadPoolExecutor(1) as executor:
