@@ -69,10 +69,11 @@ def test_given_matches_of_a_symmetric_building_are_not_folded(tmp_path, max_view
 
 
 @pytest.mark.parametrize("matlab", [False, True], ids=["plain, LF", "MATLAB, CRLF"])
-def test_given_matches_give_model_table_and_report(tmp_path, matlab):
+def test_given_matches_give_model_table_and_report(tmp_path, matlab, caplog):
     truth = write_given_matches(tmp_path / "scene", matlab=matlab)
     out = tmp_path / "out"
     assert main(["reconstruct", str(tmp_path / "scene"), "-o", str(out)]) == 0
+    assert not caplog.records  # matches may come without photos
     record = json.loads((out / "run.json").read_text())
     assert record["summary"]["registered"] == 4
     assert {row["stage"] for row in record["table"]} >= {"linear triangulation", "PnP RANSAC", "after BA"}

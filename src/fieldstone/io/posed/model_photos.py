@@ -35,18 +35,21 @@ def read_model_photos(source: Path, photos: Path | None = None, *, taken_from: P
         raise InputError(
             f"{folder}: holds none of the {len(model.registered())} photos of the model; give their folder as `photos`"
         )
+    for problem in scene.problems:
+        logger.warning("skipped %s: %s", problem.path, problem.reason)
     return scene
 
 
 def photos_of_model(model: Reconstruction, folder: Path) -> PosedScene | None:
-    """The registered views of a model whose photos lie in a folder; None if there are none."""
+    """The registered views of a model whose photos lie in a folder; None if there are none.
+
+    The others are among the `problems`.
+    """
     registered = model.registered().tolist()
     is_there = {i: (folder / model.views[i].name).is_file() for i in registered}
     problems = tuple(
         PhotoProblem(folder / model.views[i].name, "no such file") for i, there in is_there.items() if not there
     )
-    for problem in problems:
-        logger.warning("skipped %s: %s", problem.path, problem.reason)
     found = [i for i, there in is_there.items() if there]
     if not found:
         return None
