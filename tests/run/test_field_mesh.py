@@ -70,6 +70,8 @@ def test_mesh_and_splats_as_typed(ball, capsys):
     photos = ball_photos(24, heights=(0.3, 2.4, -2.2))
     best_single_color = np.mean([psnr_of_one_color(photos, v) for v in range(len(photos))])
     assert record["psnr_to_field"] > best_single_color + 20 * np.log10(2)
+    # Without its colours the ball is met to 17 dB, and a ball of one flat colour comes close to the bound above.
+    assert record["psnr_to_field"] > 22
 
 
 @pytest.mark.parametrize(("options", "message"), [({"level": 1.0}, "`level`"), ({"cells": 1}, "`cells`")])
