@@ -78,7 +78,7 @@ class PhotoOptions:
 
 @dataclass(frozen=True, eq=False)
 class House:
-    """The house, ready to be photographed."""
+    """The house, or whatever surfaces there are, ready to be photographed."""
 
     patches: tuple[Patch, ...]
     textures: tuple[Texture, ...]
@@ -98,21 +98,28 @@ class SyntheticPhotos:
 
 def make_house(texel: float, rng: np.random.Generator, *, threads: int = 2) -> House:
     """Build the house, paint it and light it; each surface draws from its own stream."""
-    surfaces = build_house(rng)
+    return painted(build_house(rng), HOUSE_CENTER, texel, rng, threads=threads)
+
+
+def painted(
+    surfaces: Sequence[Surface], center: Float[np.ndarray, "3"], texel: float, rng: np.random.Generator, *, threads: int
+) -> House:
+    """Surfaces ready to be photographed, in light that is exact near `center`."""
     sky = Sky.draw(rng)
     patches = tuple(s.patch for s in surfaces)
-    lighting = Lighting.of(patches, HOUSE_CENTER)
+    lighting = Lighting.of(patches, center)
     solid = [k for k, s in enumerate(surfaces) if s.leaf is None]
     foliage = [k for k, s in enumerate(surfaces) if s.leaf is not None]
     streams = rng.spawn(len(solid))
-    leaves = [_leaf_texture(texel, rng) for _ in range(NUM_LEAVES)]
+    leaves = [_leaf_texture(texel, rng) for _ in range(NUM_LEAVES)] if foliage else []
     with ThreadPoolExecutor(threads) as pool:
         work = zip(solid, streams, strict=True)
         jobs = [pool.submit(_bake, surfaces[k], lighting, texel, stream) for k, stream in work]
         baked = {k: job.result() for k, job in zip(solid, jobs, strict=True)}
     textures = tuple(baked[k] if s.leaf is None else leaves[s.leaf] for k, s in enumerate(surfaces))
     tints = np.ones((len(surfaces), 3), dtype=np.float32)
-    tints[foliage] = lighting.on_leaves(np.array([patches[k].corners().mean(axis=0) for k in foliage]))
+    if foliage:
+        tints[foliage] = lighting.on_leaves(np.array([patches[k].corners().mean(axis=0) for k in foliage]))
     return House(patches, textures, tints, sky)
 
 
