@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fieldstone.features.matching import MutualRatio, match_mutual
+from fieldstone.features.matching import MAX_GROWTH, MAX_TURN, match_faint, match_mutual, of_one_motion
 from fieldstone.scene.features import Features
 
 
@@ -61,6 +61,48 @@ def test_exchanging_the_photos_exchanges_the_columns():
 def test_no_features_no_matches():
     empty, some = features_of(np.empty((0, 128), dtype=np.uint8)), features_of(np.ones((3, 128), dtype=np.uint8))
     for pair in ((empty, some), (some, empty), (empty, empty)):
-        assert MutualRatio(0.8)(*pair).shape == (0, 2)
+        assert match_faint(*pair).shape == (0, 2)
+        assert match_mutual(*pair, 0.8).shape == (0, 2)
     with pytest.raises(ValueError, match="max_ratio"):
-        MutualRatio(1.5)
+        match_mutual(some, some, 1.5)
+
+
+def motion_by_loops(turn: list[float], growth: list[float]) -> list[bool]:
+    """The matches alike to the one with most alike to it, the first of several, by vectors on the unit circle."""
+
+    def alike(k: int, other: int) -> bool:
+        cosine = np.cos(turn[k]) * np.cos(turn[other]) + np.sin(turn[k]) * np.sin(turn[other])
+        return cosine > np.cos(MAX_TURN) and max(growth[k] / growth[other], growth[other] / growth[k]) < MAX_GROWTH
+
+    numbers = range(len(turn))
+    counts = [sum(alike(k, other) for other in numbers) for k in numbers]
+    best = counts.index(max(counts))
+    return [alike(best, other) for other in numbers]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_most_common_motion_is_that_of_the_definition(seed):
+    rng = np.random.default_rng(seed)
+    turn, growth = rng.uniform(-7.0, 7.0, size=80), np.exp(rng.normal(size=80))
+    turn[:20], growth[:20] = np.pi + rng.normal(0.0, 0.2, size=20), 1.5
+    assert of_one_motion(turn, growth).tolist() == motion_by_loops(turn.tolist(), growth.tolist())
+
+
+def test_faint_matches_turn_and_grow_alike():
+    rng = np.random.default_rng(0)
+    true, false = 200, 200
+    a, b = noisy_copies(true + false, true + false, rng)
+    b = np.clip(a.astype(int) + rng.integers(-20, 21, size=a.shape), 0, 255).astype(np.uint8)
+    n = true + false
+    angle, scale = rng.uniform(-np.pi, np.pi, size=n), np.exp(rng.normal(0.0, 0.7, size=n))
+    turned = np.where(np.arange(n) < true, angle + 3.0 + rng.normal(0.0, 0.05, size=n), rng.uniform(-np.pi, np.pi, n))
+    grown = np.where(np.arange(n) < true, 1.4 * scale, np.exp(rng.normal(0.0, 0.7, size=n)))
+    keypoints, colors = np.zeros((n, 2)), np.zeros((n, 3), dtype=np.uint8)
+    first = Features(keypoints, scale, angle, a, colors)
+    second = Features(keypoints, grown, np.angle(np.exp(1j * turned)), b, colors)
+    assert len(match_mutual(first, second, 0.95)) == n
+    rows = match_faint(first, second)
+    np.testing.assert_array_equal(rows[rows[:, 0] < true, 0], np.arange(true))
+    # A random turn is alike with 50 of 360 degrees, and a random growth with less than half of all.
+    assert np.sum(rows[:, 0] >= true) < false * 50 / 360
+    np.testing.assert_array_equal(match_faint(second, first), rows[:, ::-1])

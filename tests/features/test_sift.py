@@ -137,9 +137,9 @@ def test_features_under_a_mask_leave_their_room_to_others():
     image = texture(0, 300, 200)
     keep = np.zeros((200, 300), dtype=bool)
     keep[:, :100] = True
-    everything = Sift(SiftOptions(max_features=10**6))(image)
+    everything = Sift(SiftOptions(max_features=10**6, scarce=0))(image)
     inside = everything[everything.keypoints[:, 0] < 100.0]
-    masked = Sift(SiftOptions(max_features=10**6))(image, keep)
+    masked = Sift(SiftOptions(max_features=10**6, scarce=0))(image, keep)
     np.testing.assert_array_equal(masked.keypoints, inside.keypoints)
     np.testing.assert_array_equal(masked.descriptors, inside.descriptors)
     few = Sift(SiftOptions(max_features=50))(image, keep)
@@ -150,7 +150,7 @@ def test_features_under_a_mask_leave_their_room_to_others():
 
 def test_the_strongest_alone_are_described_as_among_all():
     image = texture(0, 300, 200)
-    everything = Sift(SiftOptions(max_features=10**6))(image)
+    everything = Sift(SiftOptions(max_features=10**6, scarce=0))(image)
     few = Sift(SiftOptions(max_features=50))(image)
     assert len(everything) > 80
     assert len(few) == 50
@@ -207,3 +207,32 @@ def test_threads_of_opencv_change_nothing(threads):
         assert cv2.getNumThreads() == threads
     np.testing.assert_array_equal(found.keypoints, alone.keypoints)
     np.testing.assert_array_equal(found.descriptors, alone.descriptors)
+
+
+def faint_blobs() -> tuple[np.ndarray, np.ndarray]:
+    """Blobs six grey levels high on a grid, too faint for the ordinary threshold, and where they are."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20))
+    centers = np.stack([x.ravel(), y.ravel()], axis=1) + rng.uniform(-3, 3, size=(x.size, 2))
+    column, row = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
+    grey = np.full((240, 320), 90.0)
+    for cx, cy in centers:
+        grey += 6.0 * np.exp(-((column - cx) ** 2 + (row - cy) ** 2) / (2 * 2.5**2))
+    return np.rint(grey).astype(np.uint8)[..., None].repeat(3, axis=2), centers
+
+
+def test_a_photo_that_shows_little_is_searched_for_faint_features():
+    image, centers = faint_blobs()
+    assert not len(Sift(SiftOptions(scarce=0))(image))
+    found = Sift()(image)
+    distance = np.linalg.norm(centers[:, None] - found.keypoints, axis=2).min(axis=1)
+    # Grey levels of 8 bits step in sixths of such a blob, which makes some of them too faint or too ragged.
+    assert np.mean(distance < 0.5) > 0.75
+    assert np.median(distance) < 0.2
+
+
+def test_enough_features_need_no_faint_ones():
+    image = texture(3, 640, 480)
+    options = SiftOptions(max_features=500)
+    assert options.enough_ratio * options.max_features < len(Sift(options)(image)) < options.scarce
+    np.testing.assert_array_equal(Sift(options)(image).keypoints, Sift(replace(options, scarce=0))(image).keypoints)

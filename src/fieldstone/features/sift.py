@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ DESCRIPTOR_SCALE = 512.0
 """RootSIFT descriptors have unit length; as uint8 they are multiplied by this and clipped at 255."""
 CANDIDATES = 1.6
 """Times `max_features`: so many of the strongest compete for their place in the photo."""
+ENLARGED = 2.0
+"""Factor by which photos are enlarged to find faint features, so small that the detector's own doubling misses them."""
 
 MAX_COARSE_RATIO = 0.8
 """Coarse detection at more than this ratio of the finest size would not be worth its time."""
@@ -33,6 +35,10 @@ class SiftOptions:
     """Ratio of `max_features` from which on there is no finer detection."""
     contrast_threshold: float = 0.02
     """Least contrast of a feature, times 3 and relative to the full range of grey levels."""
+    scarce: int = 600
+    """A photo that shows fewer features, and less than enough, is searched again for faint ones."""
+    faint_ratio: float = 0.25
+    """Least contrast of a faint feature over that of others."""
     edge_threshold: float = 10.0
     """Largest ratio of the principal curvatures: larger ones lie along an edge and slide."""
     cells_per_axis: int = 8
@@ -49,6 +55,10 @@ class SiftOptions:
             raise ValueError(f"enough_ratio must lie in [0, 1], got {self.enough_ratio}")
         if not 0 < self.contrast_threshold < 1:
             raise ValueError(f"contrast_threshold must lie in (0, 1), got {self.contrast_threshold}")
+        if self.scarce < 0:
+            raise ValueError(f"scarce must be at least 0 features, got {self.scarce}")
+        if not 0 < self.faint_ratio <= 1:
+            raise ValueError(f"faint_ratio must lie in (0, 1], got {self.faint_ratio}")
         if self.cells_per_axis < 1:
             raise ValueError(f"cells_per_axis must be at least 1, got {self.cells_per_axis}")
 
@@ -77,7 +87,7 @@ class Sift:
             features = self.detect(reduced_grey(image, size), image, (width, height), keep)
             if self.is_enough(features):
                 break
-        return features
+        return self.detect_faint(image, (width, height), keep) if self.is_scarce(features) else features
 
     def detection_sizes(self, width: int, height: int) -> tuple[int, ...]:
         """Longer sides of the photo, from coarse to fine, at which features are detected until there are enough."""
@@ -88,6 +98,28 @@ class Sift:
     def is_enough(self, features: Features) -> bool:
         """Whether a finer detection is not worth its time."""
         return len(features) >= self.options.enough_ratio * self.options.max_features
+
+    def is_scarce(self, features: Features) -> bool:
+        """Whether a photo shows so little that faint features are worth their time."""
+        return len(features) < self.options.scarce and not self.is_enough(features)
+
+    def detect_faint(
+        self, image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], keep: Bool[np.ndarray, "h w"] | None = None
+    ) -> Features:
+        """Features of low contrast too, down to the smallest: on the photo enlarged twice, up to `max_image_size`.
+
+        Args:
+            image: At full size.
+            size, keep: As for `detect`.
+        """
+        options = self.options
+        faint = replace(options, contrast_threshold=options.faint_ratio * options.contrast_threshold)
+        grey = reduced_grey(image, options.max_image_size)
+        factor = min(ENLARGED, options.max_image_size / max(grey.shape))
+        if factor > 1.0:
+            larger = round(grey.shape[1] * factor), round(grey.shape[0] * factor)
+            grey = np.asarray(cv2.resize(grey, larger, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+        return Sift(faint).detect(grey, image, size, keep)
 
     def detect(
         self,

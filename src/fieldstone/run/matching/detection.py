@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,6 +39,8 @@ class DetectedPhoto:
     sharpness: float = 1.0
     """See `sharpness`."""
     mask: Path | None = None
+    faint: bool = False
+    """Features of low contrast are among them, for there were too few others."""
 
     def pixel_scale(self, max_image_size: int) -> float:
         """Pixels of the photo per pixel of the detector at its finest; 1 for a photo that is not reduced."""
@@ -96,10 +99,10 @@ def _detected(path: Path, mask: Path | None, extractor: Sift, cache: UnitCache) 
         return DetectedPhoto(info, Features(**unit.arrays), key, mask=mask, **unit.facts)
     keep = None if mask is None else read_mask(mask, info)
     try:
-        features, sharp = _coarse_to_fine(extractor, info, keep)
+        features, facts = _coarse_to_fine(extractor, info, keep)
     except InputError as error:
         return _unusable(path, error)
-    facts = {"kept": 1.0 if keep is None else float(keep.mean()), "sharpness": sharp}
+    facts |= {"kept": 1.0 if keep is None else float(keep.mean())}
     cache.keep(STAGE, key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
     return DetectedPhoto(info, features, key, mask=mask, **facts)
 
@@ -123,8 +126,13 @@ def _unusable(path: Path, error: InputError) -> PhotoProblem:
     return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
 
 
-def _coarse_to_fine(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None) -> tuple[Features, float]:
-    """Features of a photo, and its sharpness at the coarse size; it is decoded no larger than each size needs."""
+def _coarse_to_fine(
+    extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None
+) -> tuple[Features, dict[str, Any]]:
+    """Features of a photo, its sharpness at the coarse size, and whether faint ones had to be taken.
+
+    It is decoded no larger than each size needs.
+    """
 
     def detect_at(size: int) -> tuple[Features, float]:
         image = read_photo(info.path, at_least_px=size).rgb
@@ -136,7 +144,10 @@ def _coarse_to_fine(extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h 
     for size in finer:
         if not extractor.is_enough(features):
             features, _ = detect_at(size)
-    return features, sharp
+    scarce = extractor.is_scarce(features)
+    if scarce:
+        features = extractor.detect_faint(read_photo(info.path).rgb, (info.width, info.height), keep)
+    return features, {"sharpness": sharp, "faint": scarce}
 
 
 @contextmanager

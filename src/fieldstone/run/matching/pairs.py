@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Int
 
-from fieldstone.features.matching import MutualRatio
+from fieldstone.features.matching import match_faint, match_mutual
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3
@@ -16,6 +16,7 @@ from fieldstone.io.files.cache import Packing, Unit, UnitCache, code_version, ke
 from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.run.matching.detection import DetectedPhoto
 from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 
 
@@ -27,13 +28,13 @@ def match_pairs(
     on_progress: OnProgress = silent,
 ) -> MatchGraph:
     """Putative matches of the pairs, in their order; pairs without any are left out."""
-    matcher = MutualRatio(options.max_ratio)
+    features = [photo.features for photo in photos]
     progress = StageProgress(on_progress, "matching", len(pairs))
 
     def work(some: Sequence[ImagePair]) -> Iterator[Int[np.ndarray, "_ 2"]]:
         progress.at(len(pairs) - len(some))  # the others are kept from an earlier run
         with ThreadPoolExecutor(options.threads) as pool:
-            matches = pool.map(lambda pair: matcher(photos[pair[0]].features, photos[pair[1]].features), some)
+            matches = pool.map(lambda pair: match_pair(photos, features, pair, options.max_ratio), some)
             yield from progress.each(matches)
 
     keys = [key_of(code_version(), photos[i].key, photos[j].key, options.max_ratio) for i, j in pairs]
@@ -46,6 +47,19 @@ def match_pairs(
         {pair: rows for pair, rows in zip(pairs, matches, strict=True) if len(rows)},
         pixel_scale=np.array([photo.pixel_scale(options.sift.max_image_size) for photo in photos]),
     )
+
+
+def match_pair(
+    photos: Sequence[DetectedPhoto], features: Sequence[Features], pair: ImagePair, max_ratio: float
+) -> Int[np.ndarray, "m 2"]:
+    """Putative matches of two photos.
+
+    Args:
+        features: Of every photo.
+        max_ratio: Ratio test of photos without faint features.
+    """
+    a, b = (features[k] for k in pair)
+    return match_faint(a, b) if any(photos[k].faint for k in pair) else match_mutual(a, b, max_ratio)
 
 
 def verify(

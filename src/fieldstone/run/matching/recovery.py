@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.features.guided_numba import match_guided_numba
-from fieldstone.features.matching import match_mutual
 from fieldstone.features.pairs import preview_counts
 from fieldstone.features.sift import Sift
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.run.matching.detection import DetectedPhoto, opencv_threads
 from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.pairs import match_pair
 from fieldstone.scene.features import Features
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 
@@ -133,7 +133,7 @@ class Rematcher:
     ) -> MatchGraph | None:
         with ThreadPoolExecutor(self.options.threads) as pool:
             ratio = self.options.max_ratio
-            found = list(pool.map(lambda pair: match_mutual(features[pair[0]], features[pair[1]], ratio), pairs))
+            found = list(pool.map(lambda pair: match_pair(self.photos, features, pair, ratio), pairs))
         return self._verified(graph, pairs, found, unregistered)
 
     def _verified(
