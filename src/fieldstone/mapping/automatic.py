@@ -21,6 +21,7 @@ from fieldstone.mapping.disambiguation.visual_aliasing import Disambiguation, di
 from fieldstone.mapping.global_mapper import map_global
 from fieldstone.mapping.incremental.checkpoint import CheckpointStore
 from fieldstone.mapping.incremental.mapper import collapsed, map_incremental
+from fieldstone.mapping.incremental.merging import merge_linked
 from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.incremental.registration import verdict_of_pairs
 from fieldstone.mapping.incremental.state import SubModel
@@ -117,7 +118,8 @@ def register(
     calibration = [None if known[c] else first_step(camera) for c, camera in enumerate(cameras)]
     start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
-    return mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, store, on_progress)
+    found = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, store, on_progress)
+    return merge_linked(found, graph, options.incremental, seed)
 
 
 def finish_all(

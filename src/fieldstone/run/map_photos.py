@@ -21,6 +21,7 @@ from fieldstone.progress import OnProgress, silent
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
 from fieldstone.run.matching.recovery import RecoveryStage, Rematcher, Unregistered
+from fieldstone.run.matching.reverification import with_cameras_of_models
 from fieldstone.run.reconstruct_options import Mapper
 from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.match_graph import MatchGraph
@@ -100,6 +101,12 @@ def map_disambiguated(
     cameras, camera_of_image = matched.cameras, matched.camera_of_image
     graph = found.graph
     sub_models = register(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    again = with_cameras_of_models(matched, sub_models, matching, seed)
+    if again is not None:
+        matched, cameras = again, again.cameras
+        found = disambiguate(matched.graph, cameras, camera_of_image, options.disambiguation)
+        graph = found.graph
+        sub_models = register(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
     if matched.photos and not found.left_out.any():  # matching anew would find again what was left out
         stages = Rematcher(matched.photos, camera_of_image, matching, seed).stages()
         sub_models, graph = recover(sub_models, graph, stages, options.incremental, seed, store, on_progress)
