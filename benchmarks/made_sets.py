@@ -64,7 +64,7 @@ def made_set(name: str, folder: Path) -> tuple[Path, Reconstruction]:
 @lru_cache(maxsize=1)
 def house() -> SyntheticPhotos:
     """Ordinary photos of the house."""
-    return make_photos(PhotoOptions(num_photos=PHOTOS, focal_35mm=30), np.random.default_rng(7))
+    return make_photos(PhotoOptions(num_photos=PHOTOS, focal_35mm=30, arc_deg=110.0), np.random.default_rng(7))
 
 
 @lru_cache(maxsize=1)

@@ -36,7 +36,7 @@ class TurntableOptions:
     width: int = 640
     height: int = 480
     focal_px: float = 560.0
-    distance: float = 6.5
+    distance: float = 4.6
     """From the camera to the middle of the object, in its units: it is about two high."""
     elevation_deg: float = 22.0
     """Of the camera above the middle of the object."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ class DetectedPhoto:
     mask: Path | None = None
     faint: bool = False
     """Features of low contrast are among them, for there were too few others."""
+    static_cells: Bool[np.ndarray, "_ _"] | None = None
+    """Cells of the photo in which nothing moves with the scene, see `features.static_content`; None: there are none."""
 
     def pixel_scale(self, max_image_size: int) -> float:
         """Pixels of the photo per pixel of the detector at its finest; 1 for a photo that is not reduced."""
@@ -48,7 +50,17 @@ class DetectedPhoto:
 
     def pixels(self) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
         """The photo, decoded, and which of its pixels are kept; None: all."""
-        return read_photo(self.info.path).rgb, None if self.mask is None else read_mask(self.mask, self.info)
+        keep = None if self.mask is None else read_mask(self.mask, self.info)
+        if self.static_cells is not None:
+            size = self.info.width, self.info.height
+            moves = cv2.resize((~self.static_cells).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            keep = moves if keep is None else keep & moves
+        return read_photo(self.info.path).rgb, keep
+
+    def without(self, static: Bool[np.ndarray, "n"], cells: Bool[np.ndarray, "_ _"] | None) -> DetectedPhoto:
+        """The photo without the features that do not move with the scene, and without cells in which nothing does."""
+        key = key_of(self.key, np.packbits(static).tobytes().hex())
+        return replace(self, features=self.features[~static], key=key, static_cells=cells)
 
 
 def detect(

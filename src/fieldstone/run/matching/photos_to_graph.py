@@ -25,6 +25,7 @@ from fieldstone.run.matching.detection import DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.pairs import match_pairs, verify
 from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, vote_on_focal
+from fieldstone.run.matching.static import without_static_content
 from fieldstone.scene.match_graph import MatchGraph
 
 logger = logging.getLogger(__name__)
@@ -87,17 +88,13 @@ def match_photos(
             f"{folder}: a reconstruction needs at least two different readable photos, found {len(photos)}{reasons}; "
             "add photos"
         )
-    infos, features = [photo.info for photo in photos], [photo.features for photo in photos]
+    infos = [photo.info for photo in photos]
     stop("features")
     cameras, camera_of_image, source = cameras_of_photos(infos, options)
-    pairs = choose_pairs(
-        features,
-        options.pairs,
-        np.random.default_rng([seed, len(features)]),
-        positions=gps_positions(infos),
-        threads=options.threads,
-    )
-    graph = match_pairs(photos, pairs, options, cache, on_progress)
+    graph = _putative(photos, options, seed, cache, on_progress)
+    moving, static_notes = without_static_content(photos, graph, cameras, camera_of_image, options, seed)
+    if moving is not photos:
+        photos, graph = moving, _putative(moving, options, seed, cache, on_progress)
     stop("matching")
     cameras, notes = vote_on_focal(graph, cameras, camera_of_image, source, options, seed)
     graph = verify(graph, photos, cameras, camera_of_image, options, seed, cache, on_progress)
@@ -115,8 +112,19 @@ def match_photos(
         seconds,
         tuple(photos),
         sharpness,
-        notes,
+        [*static_notes, *notes],
     )
+
+
+def _putative(
+    photos: Sequence[DetectedPhoto], options: MatchingOptions, seed: int, cache: UnitCache, on_progress: OnProgress
+) -> MatchGraph:
+    """Putative matches of the pairs of photos that seem to show the same."""
+    features = [photo.features for photo in photos]
+    rng = np.random.default_rng([seed, len(features)])
+    positions = gps_positions([photo.info for photo in photos])
+    pairs = choose_pairs(features, options.pairs, rng, positions=positions, threads=options.threads)
+    return match_pairs(photos, pairs, options, cache, on_progress)
 
 
 def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
