@@ -7,10 +7,9 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.io.images.exif import ExifFacts
 from fieldstone.io.images.photos import PhotoInfo
-from fieldstone.mapping.automatic import AutomaticOptions, finish_all, register
-from fieldstone.mapping.disambiguation.visual_aliasing import disambiguate
+from fieldstone.mapping.automatic import AutomaticOptions, finish_all, place
+from fieldstone.mapping.disambiguation.disambiguate import Disambiguation
 from fieldstone.mapping.incremental.options import IncrementalOptions
-from fieldstone.mapping.incremental.state import SubModel
 from fieldstone.run.map_photos import recover
 from fieldstone.run.matching.detection import DetectedPhoto
 from fieldstone.run.matching.options import MatchingOptions
@@ -55,18 +54,17 @@ def without_last(scene: SyntheticScene) -> MatchGraph:
     return verify_pairs(graph, scene.truth.cameras, ONE_CAMERA, TwoViewOptions(), 0, 1)
 
 
-def registered(scene: SyntheticScene, graph: MatchGraph) -> list[SubModel]:
-    return register(graph, scene.truth.cameras, ONE_CAMERA, np.array([True]), AutomaticOptions(), 0)
+def placed(scene: SyntheticScene, graph: MatchGraph) -> Disambiguation:
+    return place(graph, scene.truth.cameras, ONE_CAMERA, np.array([True]), AutomaticOptions(), 0)
 
 
 def test_a_photo_whose_pairs_were_not_chosen_is_registered(scene):
     graph, cameras, options = without_last(scene), scene.truth.cameras, AutomaticOptions()
-    before = registered(scene, graph)
-    assert [sub_model.num_registered for sub_model in before] == [5]
+    before = placed(scene, graph)
+    assert [sub_model.num_registered for sub_model in before.sub_models] == [5]
     rematcher = Rematcher(detected_photos(scene), ONE_CAMERA, OPTIONS, 0)
-    after, larger = recover(before, graph, [rematcher.other_pairs], options.incremental, 0)
-    found = disambiguate(graph, cameras, ONE_CAMERA, options.disambiguation)
-    run = finish_all(found, larger, after, cameras, ONE_CAMERA, options, 0)
+    after = recover(before, [rematcher.other_pairs], options.incremental, 0)
+    run = finish_all(after, cameras, ONE_CAMERA, options, 0)
     assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.2, relative_distance=0.005)
     assert run.verdicts[graph.names[LAST]].startswith("registered")
 
@@ -86,15 +84,15 @@ def test_epipolar_lines_bring_matches_that_the_ratio_test_lost(scene):
 
 def test_a_stage_that_gains_nothing_changes_nothing(scene):
     graph = without_last(scene)
-    before, asked = registered(scene, graph), []
+    before, asked = placed(scene, graph), []
 
     def same_graph(graph: MatchGraph, unregistered: Unregistered) -> MatchGraph:
         asked.append(unregistered)
         return graph
 
-    after, same = recover(before, graph, [same_graph, lambda graph, unregistered: None], IncrementalOptions(), 0)
-    assert after is before
-    assert same is graph
+    after = recover(before, [same_graph, lambda graph, unregistered: None], IncrementalOptions(), 0)
+    assert after.sub_models == before.sub_models
+    assert after.graph is graph
     assert asked[0].photos == (LAST,)
     assert asked[0].registered.tolist() == [True] * LAST + [False]
 
@@ -105,6 +103,8 @@ def test_no_stage_is_asked_where_every_photo_is_registered(scene):
     def not_needed(graph: MatchGraph, unregistered: Unregistered) -> MatchGraph:
         raise AssertionError("every photo is registered")
 
-    before = registered(scene, graph)
-    assert recover(before, graph, [not_needed], IncrementalOptions(), 0) == (before, graph)
-    assert recover([], graph, [not_needed], IncrementalOptions(), 0) == ([], graph)
+    before = placed(scene, graph)
+    after = recover(before, [not_needed], IncrementalOptions(), 0)
+    assert (after.sub_models, after.graph) == (before.sub_models, graph)
+    nothing = replace(before, sub_models=())
+    assert recover(nothing, [not_needed], IncrementalOptions(), 0).sub_models == ()

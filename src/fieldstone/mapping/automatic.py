@@ -1,8 +1,8 @@
 """From a verified match graph to finished models, with nothing that has to be set by hand.
 
-Four steps: `disambiguate` takes out false pairs, `register` places the photos, `finish` calibrates and adjusts each
-sub-model, `to_mapping_run` tells of it. `map_automatic` is the four in a row; where photos can be matched anew,
-`run.map_photos` recovers unregistered ones between the second and the third.
+Three steps: `place` registers the photos, so that no places that look alike lie upon each other; `finish` calibrates
+and adjusts each sub-model; `to_mapping_run` tells of it. `map_automatic` is the three in a row; where photos can be
+matched anew, `run.map_photos` recovers unregistered ones between the first and the second.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.mapping.disambiguation.disambiguate import Disambiguation, disambiguate
 from fieldstone.mapping.disambiguation.options import DisambiguationOptions
-from fieldstone.mapping.disambiguation.visual_aliasing import Disambiguation, disambiguate, with_disambiguation
 from fieldstone.mapping.global_mapper import map_global
 from fieldstone.mapping.incremental.checkpoint import CheckpointStore
 from fieldstone.mapping.incremental.mapper import collapsed, map_incremental
@@ -99,9 +99,26 @@ def map_automatic(
         store: Where a registration that was stopped is taken up again.
         on_progress: Told of registered photos and finished models.
     """
-    found = disambiguate(graph, cameras, camera_of_image, options.disambiguation)
-    sub_models = register(found.graph, cameras, camera_of_image, known, options, seed, store, on_progress)
-    return finish_all(found, found.graph, sub_models, cameras, camera_of_image, options, seed, on_progress)
+    found = place(graph, cameras, camera_of_image, known, options, seed, store, on_progress)
+    return finish_all(found, cameras, camera_of_image, options, seed, on_progress)
+
+
+def place(
+    graph: MatchGraph,
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    known: Bool[np.ndarray, "c"],
+    options: AutomaticOptions,
+    seed: int,
+    store: CheckpointStore | None = None,
+    on_progress: OnProgress = silent,
+) -> Disambiguation:
+    """The registered sub-models that the photos speak for; arguments as `map_automatic`."""
+
+    def register_graph(graph: MatchGraph) -> list[SubModel]:
+        return register(graph, cameras, camera_of_image, known, options, seed, store, on_progress)
+
+    return disambiguate(graph, cameras, camera_of_image, register_graph, options.disambiguation)
 
 
 def register(
@@ -114,7 +131,7 @@ def register(
     store: CheckpointStore | None = None,
     on_progress: OnProgress = silent,
 ) -> list[SubModel]:
-    """The sub-models of a graph without false pairs, the one with most photos first; arguments as `map_automatic`."""
+    """The sub-models of a graph, the one with most photos first; arguments as `map_automatic`."""
     calibration = [None if known[c] else first_step(camera) for c, camera in enumerate(cameras)]
     start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
@@ -123,9 +140,7 @@ def register(
 
 
 def finish_all(
-    disambiguation: Disambiguation,
-    graph: MatchGraph,
-    sub_models: Sequence[SubModel],
+    found: Disambiguation,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
     options: AutomaticOptions,
@@ -135,16 +150,30 @@ def finish_all(
     """Every sub-model finished, and the run that tells of them.
 
     Args:
-        graph: The one that the sub-models were registered with.
         cameras: As given, before anything was refined.
     """
-    progress = StageProgress(on_progress, "finishing models", len(sub_models))
+    progress = StageProgress(on_progress, "finishing models", len(found.sub_models) + len(found.alternative))
     finished = [
         finish(sub_model, options, np.random.default_rng([seed, k]))
-        for k, sub_model in enumerate(progress.each(sub_models))
+        for k, sub_model in enumerate(progress.each([*found.sub_models, *found.alternative]))
     ]
-    run = to_mapping_run(graph, sub_models, finished, cameras, camera_of_image, options)
-    return with_disambiguation(run, disambiguation, options.disambiguation)
+    count = len(found.sub_models)
+    run = to_mapping_run(found.graph, found.sub_models, finished[:count], cameras, camera_of_image, options)
+    return with_disambiguation(run, found, [other.model for other in finished[count:]])
+
+
+def with_disambiguation(run: MappingRun, found: Disambiguation, alternative: Sequence[WorkingModel]) -> MappingRun:
+    """The run with what is to be told of places that look alike, and the models of the alternative."""
+    verdicts = dict(run.verdicts)
+    for name, count in zip(run.graph.names, found.left_out.tolist(), strict=True):
+        if count and not verdicts[name].startswith("registered"):
+            verdicts[name] += f"; {count} of its pairs were left out, because places look alike (see the notes)"
+    return replace(
+        run,
+        notes=(*found.notes, *run.notes),
+        verdicts=verdicts,
+        alternative=tuple(to_reconstruction(model, run.graph) for model in alternative),
+    )
 
 
 def finish(sub_model: SubModel, options: AutomaticOptions, rng: np.random.Generator) -> FinishedModel:

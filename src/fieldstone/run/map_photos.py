@@ -1,4 +1,4 @@
-"""Matched photos to models: disambiguate, register, recover unregistered photos, finish."""
+"""Matched photos to models: place the photos, recover those that no model holds, finish."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import Literal
 import numpy as np
 
 from fieldstone.features.verification import verify_pairs
-from fieldstone.mapping.automatic import AutomaticOptions, finish_all, register
-from fieldstone.mapping.disambiguation.visual_aliasing import Disambiguation, disambiguate
+from fieldstone.mapping.automatic import AutomaticOptions, finish_all, place
+from fieldstone.mapping.disambiguation.disambiguate import Disambiguation
 from fieldstone.mapping.incremental.checkpoint import CheckpointStore
 from fieldstone.mapping.incremental.mapper import continue_with_graph
 from fieldstone.mapping.incremental.options import IncrementalOptions
-from fieldstone.mapping.incremental.state import SubModel
 from fieldstone.mapping.textbook import TextbookOptions, for_pixel_scale, map_textbook
 from fieldstone.progress import OnProgress, silent
 from fieldstone.run.matching.options import MatchingOptions
@@ -24,7 +23,6 @@ from fieldstone.run.matching.recovery import RecoveryStage, Rematcher, Unregiste
 from fieldstone.run.matching.reverification import with_cameras_of_models
 from fieldstone.run.reconstruct_options import Mapper
 from fieldstone.scene.mapping_run import MappingRun
-from fieldstone.scene.match_graph import MatchGraph
 
 logger = logging.getLogger(__name__)
 
@@ -45,8 +43,16 @@ def map_photos(
         matching: How the photos were matched, and are matched again.
         store: Where a registration that was stopped is taken up again.
     """
-    found = disambiguate(matched.graph, matched.cameras, matched.camera_of_image, options.disambiguation)
-    return map_disambiguated(matched, found, matching, options, seed, store, on_progress)
+    cameras, camera_of_image = matched.cameras, matched.camera_of_image
+    found = place(matched.graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    again = with_cameras_of_models(matched, found.sub_models, matching, seed)
+    if again is not None:
+        matched, cameras = again, again.cameras
+        found = place(matched.graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    if matched.photos and not found.left_out.any():  # matching anew would find again what was left out
+        stages = Rematcher(matched.photos, camera_of_image, matching, seed).stages()
+        found = recover(found, stages, options.incremental, seed, store, on_progress)
+    return finish_all(found, cameras, camera_of_image, options, seed, on_progress)
 
 
 def map_given_matches(
@@ -68,12 +74,10 @@ def map_given_matches(
         return mapper, map_with_textbook(matched, textbook, seed, on_progress)
     graph, cameras, camera_of_image = matched.graph, matched.cameras, matched.camera_of_image
     graph = verify_pairs(graph, cameras, camera_of_image, matching.two_view, seed, matching.threads, on_progress)
-    found = disambiguate(graph, cameras, camera_of_image, options.disambiguation)
-    if mapper == "auto" and not found.left_out.any():
+    found = place(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    if mapper == "auto" and not found.notes:
         return "textbook", map_with_textbook(matched, textbook, seed, on_progress)
-    verified = replace(matched, graph=graph)
-    run = map_disambiguated(verified, found, matching, options, seed, store, on_progress)
-    return options.mapper, run
+    return options.mapper, finish_all(found, cameras, camera_of_image, options, seed, on_progress)
 
 
 def map_with_textbook(
@@ -88,45 +92,20 @@ def map_with_textbook(
     return map_textbook(matched.graph, matched.cameras, matched.camera_of_image, textbook, seed, on_progress)
 
 
-def map_disambiguated(
-    matched: MatchedPhotos,
-    found: Disambiguation,
-    matching: MatchingOptions,
-    options: AutomaticOptions,
-    seed: int,
-    store: CheckpointStore | None = None,
-    on_progress: OnProgress = silent,
-) -> MappingRun:
-    """`map_photos` once it is known which pairs are false."""
-    cameras, camera_of_image = matched.cameras, matched.camera_of_image
-    graph = found.graph
-    sub_models = register(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
-    again = with_cameras_of_models(matched, sub_models, matching, seed)
-    if again is not None:
-        matched, cameras = again, again.cameras
-        found = disambiguate(matched.graph, cameras, camera_of_image, options.disambiguation)
-        graph = found.graph
-        sub_models = register(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
-    if matched.photos and not found.left_out.any():  # matching anew would find again what was left out
-        stages = Rematcher(matched.photos, camera_of_image, matching, seed).stages()
-        sub_models, graph = recover(sub_models, graph, stages, options.incremental, seed, store, on_progress)
-    return finish_all(found, graph, sub_models, cameras, camera_of_image, options, seed, on_progress)
-
-
 def recover(
-    sub_models: list[SubModel],
-    graph: MatchGraph,
+    found: Disambiguation,
     stages: Sequence[RecoveryStage],
     options: IncrementalOptions,
     seed: int,
     store: CheckpointStore | None = None,
     on_progress: OnProgress = silent,
-) -> tuple[list[SubModel], MatchGraph]:
-    """The sub-models with the largest one extended where more matches allow it, and the graph that it took.
+) -> Disambiguation:
+    """The same with the largest sub-model extended where more matches allow it.
 
     Stages of matching follow each other while photos are left that no sub-model holds; one that gains no photo changes
     nothing.
     """
+    sub_models, graph = list(found.sub_models), found.graph
     for rematch in stages if sub_models else ():
         largest = sub_models[0]
         registered, held = largest.model.registered, np.any([s.model.registered for s in sub_models], axis=0)
@@ -141,4 +120,4 @@ def recover(
         logger.info("recovery registers %d of %d photos", gained, len(unregistered))
         if larger is not None and gained > 0:
             sub_models, graph = [larger, *sub_models[1:]], larger_graph
-    return sub_models, graph
+    return replace(found, sub_models=tuple(sub_models), graph=graph)

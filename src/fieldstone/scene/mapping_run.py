@@ -94,6 +94,8 @@ class MappingRun:
     """For every photo: registered, or why not."""
     others: tuple[Reconstruction, ...] = ()
     """Further components, ranked; they share no photo with the reconstruction."""
+    alternative: tuple[Reconstruction, ...] = ()
+    """Other models of the same photos, where these do not tell which are true; a note says what speaks for each."""
     notes: tuple[str, ...] = ()
     """Decisions of the mapper that a user should know of, such as the calibration it found."""
     uncertainty: Uncertainty | None = None

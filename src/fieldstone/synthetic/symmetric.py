@@ -11,21 +11,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from fieldstone.geometry.camera import Camera, image_from_cam
+from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rigid3 import Rigid3, look_at
-from fieldstone.scene.match_graph import ImagePair, MatchGraph
-from fieldstone.scene.reconstruction import Points, Reconstruction, View
-from fieldstone.scene.tracks import Observations
+from fieldstone.synthetic.repeated_structure import (
+    PhotographOptions,
+    RepeatedPlace,
+    RepeatedScene,
+    in_view,
+    photograph_repeated,
+)
 from fieldstone.synthetic.scenes import default_camera
 
 SIDES = 4
 HALF_WIDTH, HEIGHT, RELIEF = 1.0, 1.6, 0.12
 """Of the building, and how far its facades reach out; scene units."""
 GROUND_RADIUS, FAR_RADII = 3.0, (5.0, 12.0)
-MAX_OBLIQUENESS_DEG = 70.0
-"""A facade that is seen more obliquely has no features."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,9 @@ class SymmetricOptions:
     points_per_side: int = 400
     unique_share: float = 0.1
     """Share of a photo's keypoints that show the ground or the surroundings, which are not symmetric; on average."""
-    sides_differ: bool = False
-    """The four facades have features of their own: an ordinary building."""
+    looks: tuple[int, int, int, int] = (0, 0, 0, 0)
+    """Facades with equal numbers are the same: (0, 1, 2, 3) is an ordinary building, (0, 1, 0, 2) an object with front
+    and back alike."""
     sweep_deg: float = 360.0
     """The photos stand on an arc of this angle; 360 closes the ring."""
     jitter_deg: float = 2.0
@@ -62,64 +65,20 @@ class SymmetricOptions:
             raise ValueError(f"unique_share must lie in [0, 1), got {self.unique_share}")
 
 
-@dataclass(frozen=True, eq=False)
-class SymmetricScene:
-    """The truth, what a matcher finds, and which of the matches join keypoints of one point."""
+def synthesize_symmetric(options: SymmetricOptions, rng: np.random.Generator) -> RepeatedScene:
+    """Photograph the building: exact poses, noisy keypoints, and the matches that the ratio test leaves."""
+    poses = _ring(options, rng)
+    place = _place(options, poses, rng)
 
-    truth: Reconstruction
-    graph: MatchGraph
-    azimuth: Float[np.ndarray, "n"]
-    """Of the cameras around the building, in radians."""
-    true_matches: dict[ImagePair, Bool[np.ndarray, "_"]]
+    def sees(cam_from_world: Rigid3) -> Bool[np.ndarray, "p"]:
+        return _sees(options, cam_from_world, place)
 
-    def is_true(self, pair: ImagePair) -> bool:
-        """Whether most of a pair's matches are true."""
-        return bool(np.mean(self.true_matches[pair]) > 0.5)
+    photographs = PhotographOptions(options.camera, options.visibility, options.max_view_change_deg, options.noise_px)
+    return photograph_repeated(place, poses, sees, photographs, rng)
 
 
-@dataclass(frozen=True, eq=False)
-class _World:
-    """Points, the direction in plan that each faces (nan: any), and the look of each: equal numbers look alike."""
-
-    xyz: Float[np.ndarray, "p 3"]
-    facing: Float[np.ndarray, "p"]
-    look: Int[np.ndarray, "p"]
-
-
-def synthesize_symmetric(options: SymmetricOptions, rng: np.random.Generator) -> SymmetricScene:
-    """Photograph the building: exact poses, noisy keypoints, and the matches that the ratio test leaves.
-
-    A feature that has two equal candidates in the other photo matches neither.
-    """
-    azimuth, poses = _ring(options, rng)
-    world = _world(options, poses, rng)
-    n = options.num_photos
-    keypoints, owners, views = [], [], []
-    for k in range(n):
-        mine = rng.permutation(np.flatnonzero(_sees(options, poses[k], world)))
-        mine = mine[rng.uniform(size=len(mine)) < options.visibility]
-        exact = image_from_cam(options.camera, poses[k].apply(world.xyz[mine]))
-        keypoints.append(exact + options.noise_px * rng.normal(size=exact.shape))
-        owners.append(mine)
-        views.append(_azimuth_of_view(poses[k], world, mine))
-    matches, true_matches = {}, {}
-    for i in range(n):
-        for j in range(i + 1, n):
-            first, second = (world.look[owners[k]] for k in (i, j))
-            rows = _ratio_test(first, second, views[i], views[j], np.deg2rad(options.max_view_change_deg))
-            if len(rows):
-                matches[i, j] = rows
-                true_matches[i, j] = owners[i][rows[:, 0]] == owners[j][rows[:, 1]]
-    names = tuple(f"photo_{k:04d}.png" for k in range(n))
-    grey = tuple(np.full((len(k), 3), 128, dtype=np.uint8) for k in keypoints)
-    points = Points(world.xyz, np.full((len(world.xyz), 3), 128, dtype=np.uint8))
-    posed = tuple(View(name, 0, poses[k]) for k, name in enumerate(names))
-    truth = Reconstruction((options.camera,), posed, points, Observations.empty())
-    return SymmetricScene(truth, MatchGraph(names, tuple(keypoints), grey, matches), azimuth, true_matches)
-
-
-def _ring(options: SymmetricOptions, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n"], Rigid3]:
-    """Azimuths and `cam_from_world` of the photos; z is up."""
+def _ring(options: SymmetricOptions, rng: np.random.Generator) -> Rigid3:
+    """`cam_from_world` of the photos; z is up."""
     n, jitter = options.num_photos, np.deg2rad(options.jitter_deg)
     sweep = np.deg2rad(options.sweep_deg)
     step = sweep / n if options.sweep_deg >= 360 else sweep / (n - 1)
@@ -132,29 +91,29 @@ def _ring(options: SymmetricOptions, rng: np.random.Generator) -> tuple[Float[np
     sway = options.unevenness * rng.uniform(-0.1, 0.1, size=(3, n))
     targets = np.stack([sway[0], sway[1], 0.6 + sway[2]], axis=1)
     up = np.array([0.0, 0.0, 1.0])
-    return azimuth, Rigid3.stack([look_at(c, t, up) for c, t in zip(centers, targets, strict=True)])
+    return Rigid3.stack([look_at(c, t, up) for c, t in zip(centers, targets, strict=True)])
 
 
-def _world(options: SymmetricOptions, poses: Rigid3, rng: np.random.Generator) -> _World:
+def _place(options: SymmetricOptions, poses: Rigid3, rng: np.random.Generator) -> RepeatedPlace:
     """Four facades, and as much ground and surroundings as give the wanted share of keypoints."""
     n = options.points_per_side
     facade = rng.uniform([HALF_WIDTH, -HALF_WIDTH, 0.0], [HALF_WIDTH + RELIEF, HALF_WIDTH, HEIGHT], size=(n, 3))
     angles = np.arange(SIDES) * (2 * np.pi / SIDES)
     turns = np.array([[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]] for a in angles])
     sides = np.einsum("sij,nj->sni", turns, facade).reshape(-1, 3)
-    look = np.arange(SIDES * n) if options.sides_differ else np.tile(np.arange(n), SIDES)
-    building = _World(sides, np.repeat(angles, n), look)
+    look = (np.array(options.looks)[:, None] * n + np.arange(n)).ravel()
+    building = RepeatedPlace(sides, np.repeat(angles, n), look)
     if options.unique_share == 0:
         return building
     candidates = _surroundings(20 * n, rng)
-    around = _World(candidates, np.full(len(candidates), np.nan), SIDES * n + np.arange(len(candidates)))
+    around = RepeatedPlace(candidates, np.full(len(candidates), np.nan), SIDES * n + np.arange(len(candidates)))
     counts = [
         np.mean([_sees(options, poses[k], part).sum() for k in range(options.num_photos)])
         for part in (building, around)
     ]
     wanted = options.unique_share / (1 - options.unique_share) * counts[0] / counts[1]
     kept = slice(0, round(min(wanted, 1.0) * len(candidates)))
-    return _World(
+    return RepeatedPlace(
         np.concatenate([building.xyz, around.xyz[kept]]),
         np.concatenate([building.facing, around.facing[kept]]),
         np.concatenate([building.look, around.look[kept]]),
@@ -171,18 +130,10 @@ def _surroundings(count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 
     return xyz[far | (np.abs(xyz[:, :2]).max(axis=1) > HALF_WIDTH + RELIEF)]
 
 
-def _sees(options: SymmetricOptions, cam_from_world: Rigid3, world: _World) -> Bool[np.ndarray, "p"]:
+def _sees(options: SymmetricOptions, cam_from_world: Rigid3, place: RepeatedPlace) -> Bool[np.ndarray, "p"]:
     """In the image, on the near side of the building, and not behind it."""
-    camera, center = options.camera, cam_from_world.target_origin_in_source()
-    in_cam = cam_from_world.apply(world.xyz)
-    pixels = image_from_cam(camera, in_cam)
-    inside = (in_cam[:, 2] > 0.1) & np.all((pixels > 1) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
-    towards = center - world.xyz
-    normal = np.stack([np.cos(world.facing), np.sin(world.facing), np.zeros(len(world.xyz))], axis=1)
-    cosine = np.sum(normal * towards, axis=1) / np.linalg.norm(towards, axis=1)
-    on_building = np.isfinite(world.facing)
-    faces = cosine > np.cos(np.deg2rad(MAX_OBLIQUENESS_DEG))
-    return inside & np.where(on_building, faces, ~_behind_building(center, world.xyz))
+    behind = _behind_building(cam_from_world.target_origin_in_source(), place.xyz)
+    return in_view(options.camera, cam_from_world, place) & (np.isfinite(place.facing) | ~behind)
 
 
 def _behind_building(center: Float[np.ndarray, "3"], xyz: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "p"]:
@@ -193,28 +144,3 @@ def _behind_building(center: Float[np.ndarray, "3"], xyz: Float[np.ndarray, "p 3
     enters = np.minimum(first, second).max(axis=1)
     leaves = np.maximum(first, second).min(axis=1)
     return (enters < leaves) & (leaves > 0) & (enters < 1)
-
-
-def _azimuth_of_view(cam_from_world: Rigid3, world: _World, points: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    """From which side each point is seen, relative to the facade that it lies on."""
-    towards = cam_from_world.target_origin_in_source() - world.xyz[points]
-    return np.arctan2(towards[:, 1], towards[:, 0]) - np.nan_to_num(world.facing[points])
-
-
-def _ratio_test(
-    look1: Int[np.ndarray, "a"],
-    look2: Int[np.ndarray, "b"],
-    azimuth1: Float[np.ndarray, "a"],
-    azimuth2: Float[np.ndarray, "b"],
-    max_change: float,
-) -> Int[np.ndarray, "m 2"]:
-    """Pairs that look alike, each of which has no other candidate in the other photo."""
-    order = np.argsort(look2, kind="stable")
-    low = np.searchsorted(look2[order], look1, side="left")
-    high = np.searchsorted(look2[order], look1, side="right")
-    a = np.repeat(np.arange(len(look1)), high - low)
-    b = order[np.concatenate([np.arange(x, y) for x, y in zip(low, high, strict=True)] or [np.empty(0, dtype=int)])]
-    change = np.abs(np.angle(np.exp(1j * (azimuth1[a] - azimuth2[b]))))
-    a, b = a[change < max_change], b[change < max_change]
-    alone = (np.bincount(a, minlength=len(look1))[a] == 1) & (np.bincount(b, minlength=len(look2))[b] == 1)
-    return np.stack([a[alone], b[alone]], axis=1).astype(np.int64)

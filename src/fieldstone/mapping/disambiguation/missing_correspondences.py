@@ -111,12 +111,12 @@ def _without_matches(
         inside = (unmatched_in_cam[:, 2] > 0) & np.all((pixels > 0) & (pixels < size), axis=1)
     alone = confirmed.copy()
     alone[matched] = False
-    both = np.minimum(_per_cell(pixels[inside], size, options), _per_cell(keypoints[alone], size, options))
-    with_match = _per_cell(keypoints[matched], size, options)
+    both = np.minimum(per_cell(pixels[inside], size, options), per_cell(keypoints[alone], size, options))
+    with_match = per_cell(keypoints[matched], size, options)
     return int(both[with_match == 0].sum()), int(both.sum() + with_match.sum())
 
 
-def _per_cell(
+def per_cell(
     pixels: Float[np.ndarray, "p 2"], size: Int[np.ndarray, "2"], options: MissingOptions
 ) -> Int[np.ndarray, "c"]:
     """Number of pixels in every cell of every grid."""

@@ -8,6 +8,20 @@ import numpy as np
 
 
 @dataclass(frozen=True)
+class AgreementOptions:
+    """When a pair agrees with a model, and when it contradicts it."""
+
+    max_error_px: float = 8.0
+    """A match agrees where the point of its one keypoint appears this near to the other, times the pixel scale."""
+    min_tested: int = 8
+    """With fewer matches that have a point, nothing is said of a pair."""
+    agreeing: float = 0.5
+    """Pairs of which this share of the matches agrees are those of the model."""
+    contradicting: float = 0.3
+    """Pairs of which less agrees contradict it."""
+
+
+@dataclass(frozen=True)
 class MissingOptions:
     """How missing correspondences are counted."""
 
@@ -17,6 +31,16 @@ class MissingOptions:
     """Rays that meet at a smaller angle tell no depth."""
     min_common_depths: int = 5
     """Depths that two pairs of a photo share, for the one to give the other its scale."""
+    max_angle_deg: float = 20.0
+    """In a model: two photos see a point from the same side if their rays meet at a smaller angle ..."""
+    max_scale: float = 1.6
+    """... and their distances from it differ by a smaller factor."""
+    margin: float = 0.02
+    """Nothing is expected this near to the edge of a photo, as a share of its longer side."""
+    neighbors: int = 24
+    """Photos around each that are asked for its points."""
+    points_per_photo: int = 1000
+    """Photos with more points on average are thinned out to about as many."""
 
 
 @dataclass(frozen=True)
@@ -63,21 +87,22 @@ class PhotoOrderOptions:
 class DisambiguationOptions:
     """When a scene counts as one that repeats itself."""
 
+    suspicion: float = 0.005
+    """Share of the inliers that has to contradict the model of all pairs before any other is tried: chance matches
+    make less."""
+    contradiction: float = 0.05
+    """A model that so large a share contradicts is not believed, even if nothing tells what is true."""
+    min_explained: float = 0.9
+    """Other models have to hold as many of the photos."""
+    better: float = 1.5
+    """Factor by which less has to be missing in another model."""
     min_strong_inliers: int = 30
     """Fewer agreeing matches can come about by chance."""
-    min_contradicting_ratio: float = 0.02
-    """Ratio of strong pairs that have to contradict the others before anything is done ..."""
-    min_contradicting_pairs: int = 4
-    """... and their number."""
     min_group: int = 2
     """A single pair may be wrong for many reasons; places that look alike give several that say the same."""
-    min_same_turn_pairs: int = 4
-    """So many pairs ..."""
-    min_same_turn_ratio: float = 0.01
-    """... and such a ratio of all, cannot contradict the forest by the same turn by accident, however weak they are:
-    it is that from one side of a building to another that looks like it."""
-    min_side_turn_deg: float = 45.0
-    """Smaller turns are not those from one side of a building to another."""
+    min_denied: float = 30.0
+    """Features that deny a bridge between parts of a model, at least; and more than hold it."""
+    agreement: AgreementOptions = field(default_factory=AgreementOptions)
     missing: MissingOptions = field(default_factory=MissingOptions)
     forest: ForestOptions = field(default_factory=ForestOptions)
     order: PhotoOrderOptions = field(default_factory=PhotoOrderOptions)

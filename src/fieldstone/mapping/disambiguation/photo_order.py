@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Int
 
 from fieldstone.geometry.rotation import exp, log
 from fieldstone.mapping.disambiguation.options import DisambiguationOptions
 from fieldstone.mapping.disambiguation.rotation_forest import Pairs, RotationForest, rotation_angles
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoOrder:
-    """The forest of pairs that are near in the order of the photos, and the near pairs that turn quite differently."""
+def pairs_in_order(pairs: Pairs, num_photos: int, options: DisambiguationOptions) -> tuple[int, ...]:
+    """The pairs of photos that follow each other, with steps over one photo where those are missing.
 
-    forest: RotationForest
-    against: Int[np.ndarray, "_"]
+    Returns:
+        Rows of `pairs`; empty where too few photos follow each other.
+    """
+    gap = pairs.second - pairs.first
+    forest = RotationForest.bare(num_photos)
+    for k in np.lexsort((-pairs.inliers, gap)).tolist():
+        joins = forest.component[pairs.first[k]] != forest.component[pairs.second[k]]
+        if gap[k] <= 2 and pairs.inliers[k] >= options.min_strong_inliers and joins:
+            forest = forest.joined(pairs, k)
+    return forest.edges if len(forest.edges) >= options.order.min_same_turn * (num_photos - 1) else ()
 
 
-def forest_in_order(pairs: Pairs, num_photos: int, options: DisambiguationOptions) -> PhotoOrder | None:
-    """What the order of the photos tells, if the steps from photo to photo turn the same way.
+def forest_in_order(pairs: Pairs, num_photos: int, options: DisambiguationOptions) -> RotationForest | None:
+    """The forest of pairs that are near in the order of the photos, if the steps from photo to photo turn the same way.
 
     Steps over a corner may be wrong or missing: pairs that skip a photo or two bridge them, if they turn as far.
     """
@@ -45,4 +49,4 @@ def forest_in_order(pairs: Pairs, num_photos: int, options: DisambiguationOption
             and forest.component[pairs.first[k]] != forest.component[pairs.second[k]]
         ):
             forest = forest.joined(pairs, k)
-    return PhotoOrder(forest, np.flatnonzero((gap <= order.max_gap) & (off > np.deg2rad(options.min_side_turn_deg))))
+    return forest

@@ -154,17 +154,30 @@ class Evidence:
 
 
 def misses_less(a: PooledEvidence, b: PooledEvidence, options: ForestOptions, ratio: float | None = None) -> bool:
-    """Whether pairs `a` miss clearly less than pairs `b` (two Poisson rates, compared by their binomial law).
+    """Whether pairs `a` miss clearly less than pairs `b`.
 
     Args:
         ratio: By which factor; None: `clear_ratio`.
     """
+    one, other = ((float(pooled.missing), float(pooled.expected)) for pooled in (a, b))
+    return lower_rate(one, other, options, ratio)
+
+
+def lower_rate(
+    a: tuple[float, float], b: tuple[float, float], options: ForestOptions, ratio: float | None = None
+) -> bool:
+    """Whether the rate `a` is clearly lower than `b`: two Poisson rates, compared by their binomial law.
+
+    Args:
+        a, b: Features that are missing, and of how many.
+        ratio: By which factor; None: `clear_ratio`.
+    """
     ratio = options.clear_ratio if ratio is None else ratio
-    missing_a, missing_b = a.missing / options.features_per_region, b.missing / options.features_per_region
-    if ratio * (missing_a + 0.5) * b.expected >= missing_b * a.expected:
+    missing_a, missing_b = a[0] / options.features_per_region, b[0] / options.features_per_region
+    if a[1] <= 0 or ratio * (missing_a + 0.5) * b[1] >= missing_b * a[1]:
         return False
     together = math.ceil(missing_a + missing_b)
-    chance = bdtr(math.floor(missing_a), together, a.expected / (a.expected + b.expected))
+    chance = bdtr(math.floor(missing_a), together, a[1] / (a[1] + b[1]))
     return bool(chance < options.significance)
 
 
