@@ -76,6 +76,7 @@ def test_little_that_is_unique_tells_the_sides_apart_without_any_order():
     assert "lie upon each other" in run.notes[0]
 
 
+@pytest.mark.slow
 def test_without_any_surroundings_the_order_of_the_photos_is_recommended_and_the_fold_is_kept():
     scene, graph = ring(unique_share=0.0)
     run = map_ring(scene, graph)
@@ -100,7 +101,8 @@ ALIKE = {"max_view_change_deg": 180.0}
 """Sides that look the same from wherever they are seen: rotations of false pairs agree with each other."""
 
 
-@pytest.mark.parametrize("view", [{}, *(pytest.param(v, marks=pytest.mark.slow) for v in (EXACT_RING, OPEN_PATH))])
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [{}, EXACT_RING, OPEN_PATH])
 def test_sides_that_are_alike_from_everywhere_are_not_folded(view):
     scene, graph = ring(unique_share=0.05, **ALIKE, **view)
     run = map_ring(scene, graph)
@@ -154,6 +156,7 @@ def test_equal_houses_stand_side_by_side(unique_share):
     assert run.notes[0].startswith("ambiguous scene")
 
 
+@pytest.mark.slow
 def test_equal_houses_are_told_of_where_nothing_else_is_to_be_seen():
     scene, graph = street(unique_share=0.0)
     run = map_ring(scene, graph)

@@ -168,9 +168,14 @@ def with_disambiguation(run: MappingRun, found: Disambiguation, alternative: Seq
     for name, count in zip(run.graph.names, found.left_out.tolist(), strict=True):
         if count and not verdicts[name].startswith("registered"):
             verdicts[name] += f"; {count} of its pairs were left out, because places look alike (see the notes)"
+    notes = [*found.notes]
+    if alternative:
+        first, last = 1 + len(run.others), len(run.others) + len(alternative)
+        places = f"sparse/{first}" if first == last else f"sparse/{first} to sparse/{last}"
+        notes.append(f"ambiguous scene: the alternative is in {places}")
     return replace(
         run,
-        notes=(*found.notes, *run.notes),
+        notes=(*notes, *run.notes),
         verdicts=verdicts,
         alternative=tuple(to_reconstruction(model, run.graph) for model in alternative),
     )

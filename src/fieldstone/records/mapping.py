@@ -133,5 +133,8 @@ class RunRecord:
     photos_folder: str | None = None
     """Where the photos lie, relative to the folder of the run, so that the two may move together."""
     masks_folder: str | None = None
+    alternative: tuple[int, ...] = ()
+    """Registered photos of the models of an alternative, which follow the others: where places look alike and the
+    photos do not tell which is true."""
     truth: TruthErrors | None = field(default=None)
     """Where the photos are made, and the truth is known."""

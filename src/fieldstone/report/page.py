@@ -153,7 +153,8 @@ def _facts_of_model(run: RunRecord) -> list[_Fact]:
         _Fact(
             f"{_number(summary.registered, 0)} of {_number(summary.photos, 0)}",
             "photos registered",
-            f"in {len(run.components)} models: {sizes}" if several else f"by the {run.mapper} mapper",
+            (f"in {len(run.components)} models: {sizes}" if several else f"by the {run.mapper} mapper")
+            + (", and an alternative" if run.alternative else ""),
         ),
         _Fact(_number(summary.points, 0), "points", f"each seen in {length} photos on average"),
         _Fact(

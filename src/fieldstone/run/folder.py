@@ -174,7 +174,7 @@ class RunFolder:
             record = self.read_run()
         except InputError:
             return 0
-        return 0 if record is None else len(record.components)
+        return 0 if record is None else len(record.components) + len(record.alternative)
 
     def write_covariance(self, uncertainty: Uncertainty | None, names: Sequence[str]) -> None:
         """`views` (n, 6, 6) and `points` (p, 3, 3); None: those of an earlier run go."""

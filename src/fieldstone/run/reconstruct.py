@@ -162,6 +162,7 @@ def run_record(
         seconds={stage: round(value, 3) for stage, value in seconds.items()},
         summary=summary_of(model, len(verdicts)),
         components=sizes_of((model, *run.others)),
+        alternative=sizes_of(run.alternative),
         cameras=tuple(CameraRecord.of(camera) for camera in model.cameras),
         notes=(*photos.notes, *run.notes),
         photos=verdicts,

@@ -83,6 +83,11 @@ class Scene:
         return () if self.posed is None or self.posed.model is None else (self.posed.model,)
 
     @property
+    def alternative(self) -> tuple[Reconstruction, ...]:
+        """Other models of the same photos, where places look alike and the photos do not tell which are true."""
+        return () if self.mapped is None else self.mapped.run.alternative
+
+    @property
     def model(self) -> Reconstruction:
         """The model with most photos.
 
@@ -121,7 +126,7 @@ class Scene:
         return summary_of(self.model, len(self.model.views))
 
     def save(self, folder: str | Path, *, report: bool = True) -> None:
-        """Write `sparse/0` and so on (COLMAP), `points.ply`, `run.json`, and the report with its figures.
+        """Write `sparse/0` and so on (COLMAP; models of an alternative last), `points.ply`, `run.json`, and the report with its figures.
 
         Args:
             report: Whether to draw figures and page.
@@ -185,7 +190,7 @@ def write_scene(
         raise InputError("only a scene that was reconstructed here can be saved; this one was opened from files")
     start = time.perf_counter()
     run = scene.mapped.run
-    out.write_models(scene.models)
+    out.write_models((*scene.models, *scene.alternative))
     out.write_covariance(run.uncertainty, run.graph.names)
     if report:
         photo_of = scene.mapped.photo_of

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from fieldstone.mapping.disambiguation.missing_in_model import MissingInModel
@@ -56,23 +56,21 @@ def cut_denied_bridges(
         tree = [pair for pair in tree if pair != worst.pair]
 
 
-def _points_in_common(model: Reconstruction) -> csr_matrix:
-    """Number of points that two views both observe; nothing on the diagonal."""
+def _points_in_common(model: Reconstruction) -> Int[np.ndarray, "v v"]:
+    """Number of points that two views both observe; 0 on the diagonal."""
     observations = model.observations
     shape = len(model.views), len(model.points)
-    observes = coo_matrix((np.ones(len(observations)), (observations.view, observations.point)), shape=shape).tocsr()
-    observes.data[:] = 1.0
-    common = (observes @ observes.T).tocsr()
-    common.setdiag(0.0)
-    common.eliminate_zeros()
+    rows = np.unique(np.stack([observations.view, observations.point]), axis=1)
+    observes = coo_matrix((np.ones(rows.shape[1], dtype=np.int64), tuple(rows)), shape=shape).tocsr()
+    common = (observes @ observes.T).toarray()
+    np.fill_diagonal(common, 0)
     return common
 
 
-def _maximum_spanning_tree(common: csr_matrix) -> list[ImagePair]:
-    costs = common.copy()
-    costs.data = 1.0 / costs.data
-    tree = minimum_spanning_tree(costs).tocoo()
-    return sorted((min(a, b), max(a, b)) for a, b in zip(tree.row.tolist(), tree.col.tolist(), strict=True))
+def _maximum_spanning_tree(common: Int[np.ndarray, "v v"]) -> list[ImagePair]:
+    costs = np.where(common > 0, 1.0 / np.maximum(common, 1), 0.0)
+    rows, cols = minimum_spanning_tree(costs).nonzero()
+    return sorted((min(a, b), max(a, b)) for a, b in zip(rows.tolist(), cols.tolist(), strict=True))
 
 
 def _parts(tree: Sequence[ImagePair], num_views: int) -> Int[np.ndarray, "v"]:
@@ -83,7 +81,7 @@ def _parts(tree: Sequence[ImagePair], num_views: int) -> Int[np.ndarray, "v"]:
 def _bridge(
     k: int,
     tree: Sequence[ImagePair],
-    common: csr_matrix,
+    common: Int[np.ndarray, "v v"],
     pairs: Int[np.ndarray, "m 2"],
     counts: Float[np.ndarray, "m"],
 ) -> Bridge:
@@ -92,7 +90,7 @@ def _bridge(
     Args:
         pairs, counts: Photos that ought to share more than they do, and by how many features.
     """
-    part = _parts([*tree[:k], *tree[k + 1 :]], common.shape[0])
+    part = _parts([*tree[:k], *tree[k + 1 :]], len(common))
     one, other = (part == part[view] for view in tree[k])
     across = (one[pairs[:, 0]] & other[pairs[:, 1]]) | (one[pairs[:, 1]] & other[pairs[:, 0]])
-    return Bridge(tree[k], int(common[one][:, other].sum()), float(counts[across].sum()))
+    return Bridge(tree[k], int(common[np.ix_(one, other)].sum()), float(counts[across].sum()))

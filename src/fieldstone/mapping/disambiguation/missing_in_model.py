@@ -158,6 +158,6 @@ def _neighbors(model: Reconstruction, options: MissingOptions) -> list[tuple[int
         return []
     centers = model.camera_centers()
     count = min(options.neighbors + 1, len(views))
-    _, nearest = KDTree(centers).query(centers, k=count)
+    nearest = np.asarray(KDTree(centers).query(centers, k=count)[1])
     directed = {(int(views[a]), int(views[b])) for a, row in enumerate(nearest) for b in row if a != b}
     return sorted(directed | {(j, i) for i, j in directed})
