@@ -126,7 +126,7 @@ class Scene:
         return summary_of(self.model, len(self.model.views))
 
     def save(self, folder: str | Path, *, report: bool = True) -> None:
-        """Write `sparse/0` and so on (COLMAP; models of an alternative last), `points.ply`, `run.json`, and the report with its figures.
+        """Write `sparse/0` and so on (COLMAP; an alternative comes last), `points.ply`, `run.json`, and the report.
 
         Args:
             report: Whether to draw figures and page.
