@@ -37,11 +37,6 @@ class Pairs:
         """The photos of a row."""
         return int(self.first[k]), int(self.second[k])
 
-    def only_strong(self) -> Pairs:
-        """The strong ones."""
-        keep = self.strong
-        return Pairs(self.first[keep], self.second[keep], self.cam2_R_cam1[keep], self.inliers[keep], keep[keep])
-
 
 @dataclass(frozen=True, eq=False)
 class RotationForest:
@@ -95,15 +90,6 @@ class RotationForest:
 def rotation_angles(R: Float[np.ndarray, "r 3 3"]) -> Float[np.ndarray, "r"]:
     """Angles of rotations, in radians: trace R = 1 + 2 cos angle."""
     return np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0))
-
-
-def maximum_spanning_forest(pairs: Pairs, num_photos: int) -> RotationForest:
-    """The maximum spanning forest of the inlier counts (Kruskal)."""
-    forest = RotationForest.bare(num_photos)
-    for k in np.lexsort((pairs.second, pairs.first, -pairs.inliers)).tolist():
-        if forest.component[pairs.first[k]] != forest.component[pairs.second[k]]:
-            forest = forest.joined(pairs, k)
-    return forest
 
 
 @dataclass(frozen=True)
