@@ -99,7 +99,14 @@ def test_orientation_is_applied_once_and_recorded(tmp_path, orientation):
 
 def save_with_exif(path, **tags):
     exif = Image.Exif()
-    names = {"f35": 0xA405, "focal": 0x920A, "resolution": 0xA20E, "unit": 0xA210, "stored_width": 0xA002}
+    names = {
+        "f35": 0xA405,
+        "focal": 0x920A,
+        "resolution": 0xA20E,
+        "unit": 0xA210,
+        "stored_width": 0xA002,
+        "zoom": 0xA404,
+    }
     exif.get_ifd(IFD.Exif).update({names[k]: v for k, v in tags.items() if k in names})
     exif.get_ifd(IFD.GPSInfo).update(tags.get("gps", {}))
     exif[0x010F], exif[0x0110] = tags.get("make", "ACME"), "X1\0"
@@ -116,6 +123,11 @@ def save_with_exif(path, **tags):
         ({"focal": IFDRational(5), "resolution": IFDRational(1000), "unit": 3, "stored_width": 800}, 250.0),
         ({"focal": IFDRational(5), "resolution": IFDRational(2000), "unit": 3, "stored_width": 400}, None),
         ({"focal": IFDRational(5)}, None),
+        ({"focal": IFDRational(50), "resolution": IFDRational(1000), "unit": 3, "stored_width": 400}, None),
+        ({"f35": 28, "zoom": IFDRational(18, 10)}, 1.8 * 28 / np.hypot(36, 24) * 500),
+        ({"f35": 28, "zoom": IFDRational(0)}, 28 / np.hypot(36, 24) * 500),
+        ({"f35": 28, "zoom": IFDRational(1, 0)}, 28 / np.hypot(36, 24) * 500),
+        ({"focal": IFDRational(5), "resolution": IFDRational(1000), "unit": 3, "zoom": 2.0}, 1000.0),
         ({"f35": 0, "focal": IFDRational(5), "resolution": IFDRational(100), "unit": 4}, 500.0),
         ({"f35": 9999}, None),
         ({"focal": IFDRational(5, 0), "resolution": IFDRational(1, 0)}, None),
@@ -126,6 +138,23 @@ def test_focal_prior_in_pixels(tmp_path, tags, expected):
     facts = save_with_exif(tmp_path / "a.jpg", **tags)
     assert facts.focal_px == (None if expected is None else pytest.approx(expected))
     assert facts.camera == "ACME X1"
+
+
+def test_one_lens_at_two_settings_is_told_apart(tmp_path):
+    wide, long, cropped = (
+        save_with_exif(tmp_path / "a.jpg", **tags).lens
+        for tags in ({"focal": IFDRational(24)}, {"focal": IFDRational(70)}, {"focal": IFDRational(24), "zoom": 2.0})
+    )
+    assert len({wide, long, cropped}) == 3
+    assert save_with_exif(tmp_path / "a.jpg").lens is None
+
+
+def test_the_equivalent_of_some_makers_counts_digital_zoom(tmp_path):
+    counted, not_counted = (
+        save_with_exif(tmp_path / "a.jpg", f35=52, zoom=IFDRational(2), make=make).focal_px
+        for make in ("Apple", "ACME")
+    )
+    assert not_counted == pytest.approx(2 * counted)
 
 
 def test_gps_in_signed_degrees(tmp_path):

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fieldstone.features.verification import calibrate_from_pairs, verify_pairs
+from fieldstone.features.verification import uncalibrated_pairs, verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.incremental.options import IncrementalOptions
@@ -14,6 +14,7 @@ from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.mapping.self_calibration import _leave_one_out, prediction_errors
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import build_tracks
+from fieldstone.solve.averaging.focal_lengths import FocalPrior, estimate_focals
 from fieldstone.solve.bundle.adjustment import bundle_adjust
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, SyntheticScene, synthesize
@@ -57,10 +58,12 @@ def test_unknown_cameras_are_calibrated_by_their_own_photos():
     """
     scene = scene_of(num_points=1500, layout="ring", num_cameras=12, noise_px=0.3)
     guess = Camera("SIMPLE_PINHOLE", 1000, 750, np.array([1200.0, 500.0, 375.0]))
-    vote = calibrate_from_pairs(scene.graph, guess, np.ones(12, dtype=bool), TwoViewOptions(), 0, 2)
-    assert vote is not None
-    assert 0.5 < vote.ratio * 1000 / 800 < 2
-    voted = replace(guess, params=np.array([vote.ratio * 1000, 500.0, 375.0]))
+    one = np.zeros(12, dtype=np.int64)
+    pairs = uncalibrated_pairs(scene.graph, sorted(scene.graph.matches), (guess,), one, TwoViewOptions(), 0, 2)
+    prior = FocalPrior(np.log([1.2]), np.array([0.45]), np.array([np.nan]))
+    ratio = float(np.exp(estimate_focals(pairs.parallax, one, prior).log_focal[0]))
+    assert 0.5 < ratio * 1000 / 800 < 2
+    voted = replace(guess, params=np.array([ratio * 1000, 500.0, 375.0]))
     run = map_scene(scene, (voted,), known=False)
     camera = run.reconstruction.cameras[0]
     assert abs(camera.focal.mean() - 800) < 2

@@ -148,10 +148,10 @@ def test_every_photo_left_out_gets_a_verdict_with_a_number(photos):
     assert verdicts["house_01.jpg"] == "not used: duplicate of copy.jpg, byte for byte"
 
 
-@pytest.mark.parametrize("factor", [0.25, 10.0])
+@pytest.mark.parametrize("factor", [0.25, 0.56, 1.25, 1.8, 10.0])
 def test_a_wrong_focal_length_in_exif_is_noticed(photos, factor, caplog):
     """The cameras were given 29 mm; the vote is good to a few percent on photos of this size."""
-    truth = matched(photos).cameras[0].params[0]
+    truth = 29 / np.hypot(36.0, 24.0) * np.hypot(320, 240)
     rewrite_focal(photos, 29 * factor)
     material = matched(photos)
     (note,) = material.notes
@@ -160,13 +160,14 @@ def test_a_wrong_focal_length_in_exif_is_noticed(photos, factor, caplog):
     assert material.cameras[0].params[0] == pytest.approx(truth, rel=0.05)
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+@pytest.mark.parametrize("factor", [0.97, 1.0, 1.03])
 def test_exif_that_is_a_little_off_is_believed(photos, factor):
+    """And drawn a little towards what the photos say, which is closer to the truth or as close."""
     rewrite_focal(photos, 29 * factor)
     material = matched(photos)
     assert not material.notes
-    stated = round(29 * factor) / np.hypot(36.0, 24.0) * np.hypot(320, 240)
-    assert material.cameras[0].params[0] == pytest.approx(stated, rel=1e-9)
+    truth = 29 / np.hypot(36.0, 24.0) * np.hypot(320, 240)
+    assert material.cameras[0].params[0] == pytest.approx(truth, rel=0.04)
 
 
 def verdicts_of(folder: Path, tmp_path: Path, code: int) -> tuple[dict, dict[str, str]]:
@@ -184,7 +185,7 @@ def test_the_same_photo_saved_anew_is_no_model_and_no_focal_length(photos, tmp_p
         (photos / name).unlink()
     record, verdicts = verdicts_of(photos, tmp_path, 4)
     assert record["components"] == [0]
-    assert not record["notes"]
+    assert not any("focal" in note for note in record["notes"])
     assert all("no depth" in verdict for verdict in verdicts.values())
     assert not (tmp_path / "out" / "sparse").exists()
 

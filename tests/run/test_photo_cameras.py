@@ -27,7 +27,7 @@ def given(infos, **options):
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_given_intrinsics_speak_of_stored_pixels(orientation):
     """What falls on a pixel of the stored photo falls on where turning the photo puts this pixel."""
-    (camera,), _, _ = given([info_of(orientation)])
+    (camera,) = given([info_of(orientation)]).cameras
     # Photos that show how far right and how far down one is in the stored one.
     row, column = np.mgrid[0:480, 0:640]
     shown = [(column // 3).astype(np.uint8), (row // 2).astype(np.uint8)]
@@ -44,12 +44,42 @@ def test_given_intrinsics_speak_of_stored_pixels(orientation):
 
 def test_photos_share_a_camera_unless_it_was_turned():
     infos = [info_of(1, "a.jpg"), info_of(1, "b.jpg"), info_of(3, "c.jpg"), info_of(6, "d.jpg")]
-    for options in ({}, {"single_camera": True}):
-        cameras, camera_of_image, source = given(infos, **options)
-        assert camera_of_image.tolist() == [0, 0, 1, 2]
-        assert source == ["given"] * 3
-        assert cameras[1].principal_point.tolist() == [640 - 322, 480 - 236]
-        assert cameras[2].focal.tolist() == [510, 500]
+    for sharing in ("auto", "one", "per-folder"):
+        found = given(infos, cameras=sharing)
+        assert found.camera_of_image.tolist() == [0, 0, 1, 2]
+        assert found.source == ("given",) * 3
+        assert found.cameras[1].principal_point.tolist() == [640 - 322, 480 - 236]
+        assert found.cameras[2].focal.tolist() == [510, 500]
+
+
+def photo(name: str, camera: str | None = None, mm: float | None = None, focal_px: float | None = None) -> PhotoInfo:
+    lens = None if mm is None else ("", mm, 1.0)
+    return PhotoInfo(Path(name), 640, 480, 1, ExifFacts(focal_px, camera, lens))
+
+
+@pytest.mark.parametrize(
+    ("sharing", "groups"),
+    [("auto", [0, 0, 1, 2, 3, 3]), ("one", [0] * 6), ("per-folder", [0, 0, 0, 1, 1, 1]), ("per-photo", list(range(6)))],
+)
+def test_who_shares_a_camera_can_be_said_by_hand(sharing, groups):
+    infos = [
+        photo("x/1.jpg", "A", 24.0, 500.0),
+        photo("x/2.jpg", "A", 24.0, 500.0),
+        photo("x/3.jpg", "A", 50.0, 1000.0),  # the same zoom lens, another setting
+        photo("y/1.jpg", "B", 50.0, 1000.0),
+        photo("y/2.jpg"),
+        photo("y/3.jpg"),
+    ]
+    assert cameras_of_photos(infos, MatchingOptions(cameras=sharing)).camera_of_image.tolist() == groups
+
+
+def test_photos_without_exif_are_alone_in_the_company_of_many_cameras():
+    strangers = [photo(f"{k}.jpg", f"body {k}", 5.0) for k in range(6)]
+    unknown = [photo("a.jpg"), photo("b.jpg")]
+    found = cameras_of_photos([*strangers, *unknown], MatchingOptions())
+    assert found.camera_of_image.tolist() == list(range(8))
+    friends = [photo(f"{k}.jpg", "one body", 5.0) for k in range(6)]
+    assert cameras_of_photos([*friends, *unknown], MatchingOptions()).camera_of_image.tolist() == [0] * 6 + [1, 1]
 
 
 def test_intrinsics_that_do_not_fit_the_model_are_refused():

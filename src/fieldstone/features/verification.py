@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.epipolar import (
+    essential_from_pose,
+    fundamental_from_essential,
+    homogeneous,
+    sampson_error,
+)
 from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
-from fieldstone.solve.robust.focal_voting import FocalVote, vote_focal, vote_focal_of_rotations
+from fieldstone.solve.averaging.focal_lengths import PairEvidence
+from fieldstone.solve.robust.fundamental_covariance import fundamental_covariance, with_rank_two
 from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
-
-MAX_VOTING_PAIRS = 300
 
 
 def verify_pairs(
@@ -62,46 +67,97 @@ def two_views_of_pairs(
         yield from pool.map(verify, pairs)
 
 
-def calibrate_from_pairs(
+def voting_pairs(graph: MatchGraph, max_pairs: int, per_photo: int) -> list[ImagePair]:
+    """Pairs to ask for focal lengths: those with most matches, but some of every photo first.
+
+    Args:
+        max_pairs: Exceeded where `per_photo` pairs of every photo are more.
+        per_photo: How many of the best pairs of each photo are among them.
+    """
+    ranked = sorted(graph.matches, key=lambda pair: (-len(graph.matches[pair]), pair))
+    count, first, others = [0] * graph.num_images, [], []
+    for pair in ranked:
+        (first if min(count[k] for k in pair) < per_photo else others).append(pair)
+        for k in pair:
+            count[k] += 1
+    return sorted(first + others[: max(max_pairs - len(first), 0)])
+
+
+@dataclass(frozen=True, eq=False)
+class UncalibratedPairs:
+    """Geometry of pairs of photos whose focal lengths are not known, in units of the photos' longer sides."""
+
+    parallax: PairEvidence
+    turning: tuple[tuple[ImagePair, Float[np.ndarray, "3 3"]], ...]
+    """Pairs that one homography explains, and this homography: of a plane, or of a camera that turned."""
+    inliers: Mapping[ImagePair, int]
+
+
+def uncalibrated_pairs(
     graph: MatchGraph,
-    camera: Camera,
-    images: Bool[np.ndarray, "n"],
+    pairs: Sequence[ImagePair],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
     options: TwoViewOptions,
     seed: int,
     threads: int,
-    max_pairs: int = MAX_VOTING_PAIRS,
-) -> FocalVote | None:
-    """A vote on the unknown focal length that some photos share, over those pairs among them with most matches.
-
-    Returns:
-        The focal length over the longer side of the photo; None if the pairs say nothing of it, as those of one plane.
-    """
-    pairs = [pair for pair in sorted(graph.matches) if images[pair[0]] and images[pair[1]]]
-    pairs = sorted(pairs, key=lambda pair: (-len(graph.matches[pair]), pair))[:max_pairs]
-    unit, (cx, cy) = float(max(camera.width, camera.height)), camera.principal_point
-    pixels_from_unit = np.array([[unit, 0.0, cx], [0.0, unit, cy], [0.0, 0.0, 1.0]])
+) -> UncalibratedPairs:
+    """Fundamental matrices of pairs, with their covariances, or homographies; only the size of the cameras matters."""
     uncalibrated, scale = replace(options, focal_known=False), graph.scale_of_image
+    found = list(two_views_of_pairs(graph, pairs, cameras, camera_of_image, uncalibrated, seed, threads))
+    kept, fundamentals, covariances, turning = [], [], [], []
+    for pair, two_view in zip(pairs, found, strict=True):
+        of_pair = [cameras[camera_of_image[k]] for k in pair]
+        units = [float(max(camera.width, camera.height)) for camera in of_pair]
+        T1, T2 = (
+            np.array([[unit, 0.0, camera.width / 2], [0.0, unit, camera.height / 2], [0.0, 0.0, 1.0]])
+            for camera, unit in zip(of_pair, units, strict=True)
+        )
+        if two_view.kind == "uncalibrated":
+            F = with_rank_two(T2.T @ two_view.matrix @ T1)
+            pixels = graph.matched_pixels(pair, graph.matches[pair][two_view.inliers])
+            x1, x2 = ((px - T[:2, 2]) / unit for px, T, unit in zip(pixels, (T1, T2), units, strict=True))
+            kept.append(pair)
+            fundamentals.append(F)
+            covariances.append(
+                fundamental_covariance(F, x1, x2, (float(scale[pair[0]] / units[0]), float(scale[pair[1]] / units[1])))
+            )
+        elif two_view.kind in ("planar", "panoramic"):
+            turning.append((pair, np.linalg.inv(T2) @ two_view.matrix @ T1))
+    parallax = PairEvidence(
+        np.array(kept, dtype=np.int64).reshape(-1, 2),
+        np.array(fundamentals).reshape(-1, 3, 3),
+        np.array(covariances).reshape(-1, 9, 9),
+    )
+    inliers = {pair: int(two_view.inliers.sum()) for pair, two_view in zip(pairs, found, strict=True)}
+    return UncalibratedPairs(parallax, tuple(turning), inliers)
 
-    def geometry(pair: ImagePair) -> tuple[bool, Float[np.ndarray, "3 3"], float] | None:
-        """Whether the pair has a fundamental matrix rather than a homography, the matrix, its number of inliers."""
-        pixels1, pixels2 = graph.matched_pixels(pair)
-        rng = np.random.default_rng([seed, *pair])
-        scales = float(scale[pair[0]]), float(scale[pair[1]])
-        found = estimate_two_view(camera, camera, pixels1, pixels2, uncalibrated, rng, pixel_scales=scales)
-        inliers = float(found.inliers.sum())
-        if found.kind == "uncalibrated":
-            return True, pixels_from_unit.T @ found.matrix @ pixels_from_unit, inliers
-        if found.kind in ("planar", "panoramic"):
-            return False, np.linalg.inv(pixels_from_unit) @ found.matrix @ pixels_from_unit, inliers
-        return None
 
-    with ThreadPoolExecutor(threads) as pool:
-        found = [result for result in pool.map(geometry, pairs) if result is not None]
-    parallax, turning = ([(M, n) for is_F, M, n in found if is_F == wanted] for wanted in (True, False))
-    if sum(n for _, n in turning) > sum(n for _, n in parallax):
-        vote = vote_focal_of_rotations(np.array([H for H, _ in turning]), np.array([n for _, n in turning]))
-        if vote is not None:
-            return vote
-    if not parallax:
-        return None
-    return vote_focal(np.array([F for F, _ in parallax]), np.array([n for _, n in parallax]))
+def misfits(
+    graph: MatchGraph,
+    pairs: Sequence[ImagePair],
+    cameras: Sequence[Camera],
+    camera_of_image: Int[np.ndarray, "n"],
+    options: TwoViewOptions,
+    seed: int,
+    threads: int,
+) -> Float[np.ndarray, "p"]:
+    """How badly the matches of each pair fit the best geometry that the cameras allow.
+
+    Squared Sampson errors over the squared threshold, each 1 at most, added up over all matches (the score of
+    `torr2000`).
+    """
+    scale, limit = graph.scale_of_image, options.ransac.max_error_px**2
+
+    def misfit(pair: ImagePair, two_view: TwoView) -> float:
+        if two_view.cam2_from_cam1 is None or not np.any(two_view.cam2_from_cam1.t):
+            return float(np.sum(~two_view.inliers))
+        E = essential_from_pose(two_view.cam2_from_cam1)
+        K1, K2 = (
+            np.diag([1 / scale[k], 1 / scale[k], 1.0]) @ cameras[camera_of_image[k]].calibration_matrix() for k in pair
+        )
+        x1, x2 = (homogeneous(px / scale[k]) for k, px in zip(pair, graph.matched_pixels(pair), strict=True))
+        return float(np.minimum(sampson_error(fundamental_from_essential(E, K1, K2), x1, x2) / limit, 1.0).sum())
+
+    found = two_views_of_pairs(graph, pairs, cameras, camera_of_image, options, seed, threads)
+    return np.array([misfit(pair, two_view) for pair, two_view in zip(pairs, found, strict=True)])

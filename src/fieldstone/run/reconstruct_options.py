@@ -13,7 +13,7 @@ from fieldstone.features.pairs import PairOptions
 from fieldstone.features.sift import SiftOptions
 from fieldstone.mapping.automatic import AutomaticOptions
 from fieldstone.mapping.textbook import TextbookOptions
-from fieldstone.run.matching.options import MatchingOptions
+from fieldstone.run.matching.options import MatchingOptions, Sharing
 from fieldstone.run.options import NumbersOption, at_least, workers
 from fieldstone.solve.robust.two_view import TwoViewOptions
 
@@ -56,8 +56,9 @@ class ReconstructOptions:
     covariance: bool = False
     """Also compute how well poses and points are determined: covariance.safetensors, and the standard deviations of
     every pose in run.json."""
-    single_camera: bool = False
-    """All photos were taken by one camera, whatever their EXIF says."""
+    cameras: Sharing = "auto"
+    """Which photos share a camera. auto: those of one EXIF body, lens and zoom and, without EXIF, of one size, unless
+    the photos tell several cameras apart; one: all; per-folder: those in one folder; per-photo: none."""
     masks: Path | None = None
     """Folder with a mask for each photo, named a.jpg.png, a.jpg or a.png for a.jpg. White is kept."""
     max_image_size: int = 1600
@@ -92,7 +93,7 @@ class ReconstructOptions:
             camera_model=self.camera_model,
             intrinsics=self.intrinsics,
             fix_intrinsics=self.fix_intrinsics,
-            single_camera=self.single_camera,
+            cameras=self.cameras,
             masks=self.masks,
             threads=workers(self.threads),
         )

@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from fieldstone.features.pairs import PairOptions
 from fieldstone.features.sift import SiftOptions
 from fieldstone.solve.robust.two_view import TwoViewOptions
+
+Sharing = Literal["auto", "one", "per-folder", "per-photo"]
+"""Which photos share a camera: those of one EXIF body, lens and zoom, as far as the pairs of photos agree; all of one
+size; all of one size in a folder; none."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +32,8 @@ class MatchingOptions:
     """Parameters of the model, in pixels of the stored photo; None: from EXIF, or from the photos themselves."""
     fix_intrinsics: bool = False
     """Given intrinsics are exact."""
-    single_camera: bool = False
-    """All photos share one camera, whatever their EXIF says."""
+    cameras: Sharing = "auto"
+    """Which photos share a camera."""
     masks: Path | None = None
     """Folder with masks of the photos, see `io.masks`; no features where they are black."""
     threads: int = field(default_factory=lambda: os.cpu_count() or 1)

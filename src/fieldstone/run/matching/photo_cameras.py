@@ -1,33 +1,30 @@
-"""What is known of the cameras of photos before they are mapped: from the user, from EXIF, or by a vote of pairs."""
+"""What is known of the cameras of photos before they are matched: from the user, from EXIF, or nothing."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.errors import InputError
-from fieldstone.features.verification import MAX_VOTING_PAIRS, calibrate_from_pairs
 from fieldstone.geometry.camera import Camera, turned
 from fieldstone.io.images.photos import PhotoInfo
 from fieldstone.run.matching.options import MatchingOptions
-from fieldstone.scene.match_graph import MatchGraph
-from fieldstone.solve.robust.focal_voting import FocalVote
-
-logger = logging.getLogger(__name__)
 
 GUESSED_FOCAL = 1.2
 """Focal length over the longer side where nothing else is known of it."""
 EARTH_RADIUS_M = 6.371e6
-MIN_VOTE_CONTRAST = 0.1
-"""A vote on the focal length that is flatter than this says nothing."""
-PAIRS_TO_CHECK_EXIF = 30
-MIN_CONTRAST_AGAINST_EXIF = 0.3
-MAX_EXIF_ERROR = 2.0
-"""EXIF is off by a tenth now and then; off by this factor it belongs to another lens or crop."""
+MIN_PHOTOS_OF_MANY, SHARE_OF_MANY = 4, 0.5
+"""A set is of many cameras if of at least so many photos, more than this share name different ones."""
+
+FocalSource = Literal["given", "exif", "guess", "photos"]
+"""From the user, from EXIF, from nobody, or from the pairs among the photos."""
+
+SIGMA_OF_SOURCE: dict[FocalSource, float] = {"given": np.inf, "exif": 0.05, "guess": 0.45, "photos": 0.45}
+"""Relative standard deviations; given ones that are not exact are only a start. What pairs say is not counted twice."""
 
 TURNED_UPRIGHT = {
     2: ((-1, 0), (0, 1)),
@@ -62,21 +59,44 @@ def gps_positions(infos: Sequence[PhotoInfo]) -> Float[np.ndarray, "n 3"] | None
     return out
 
 
-def cameras_of_photos(
-    infos: Sequence[PhotoInfo], options: MatchingOptions
-) -> tuple[tuple[Camera, ...], Int[np.ndarray, "n"], list[str]]:
-    """Cameras, the camera of each photo, and where each camera's focal length comes from: given, exif or guess.
+@dataclass(frozen=True, eq=False)
+class PhotoCameras:
+    """Cameras, the camera of each photo, and what is known of each camera's focal length."""
 
-    Photos of one size, EXIF camera, EXIF focal length and orientation share a camera.
+    cameras: tuple[Camera, ...]
+    camera_of_image: Int[np.ndarray, "n"]
+    source: tuple[FocalSource, ...]
+    """Where the focal length comes from."""
+
+    @property
+    def focal_sigma(self) -> Float[np.ndarray, "c"]:
+        """By what share focal lengths from that source are off: standard deviations."""
+        return np.array([SIGMA_OF_SOURCE[source] for source in self.source])
+
+
+def cameras_of_photos(infos: Sequence[PhotoInfo], options: MatchingOptions) -> PhotoCameras:
+    """What the headers of photos say of their cameras.
+
+    Photos of one size and orientation share a camera as `options.cameras` says; left to itself, as EXIF does: one body,
+    one lens and one setting of it. Photos without EXIF share one, unless those with it come from many cameras: then
+    each has its own.
     """
+    alone = options.cameras == "auto" and _are_of_many_cameras(infos)
     cameras: list[Camera] = []
-    source: list[str] = []
+    source: list[FocalSource] = []
     index: dict[tuple, int] = {}
     camera_of_image = np.empty(len(infos), dtype=np.int64)
     for k, info in enumerate(infos):
-        exif = (None, None) if options.single_camera else (info.exif.camera, info.exif.focal_px)
+        exif = info.exif.camera, info.exif.lens, info.exif.focal_px
+        unknown = exif == (None, None, None)
+        of_whom = {
+            "auto": (exif, k if alone and unknown else None),
+            "one": None,
+            "per-folder": info.path.parent,
+            "per-photo": k,
+        }[options.cameras]
         # The camera held upside down has its principal point on the other side.
-        key = (info.width, info.height, info.orientation, *exif)
+        key = (info.width, info.height, info.orientation, of_whom)
         if key not in index:
             index[key] = len(cameras)
             if options.intrinsics is not None:
@@ -88,60 +108,16 @@ def cameras_of_photos(
                 cameras.append(Camera("SIMPLE_PINHOLE", info.width, info.height, params))
                 source.append("exif" if info.exif.focal_px else "guess")
         camera_of_image[k] = index[key]
-    return tuple(cameras), camera_of_image, source
+    return PhotoCameras(tuple(cameras), camera_of_image, tuple(source))
 
 
-def vote_on_focal(
-    graph: MatchGraph,
-    cameras: tuple[Camera, ...],
-    camera_of_image: Int[np.ndarray, "n"],
-    source: list[str],
-    options: MatchingOptions,
-    seed: int,
-) -> tuple[tuple[Camera, ...], list[str]]:
-    """Cameras without a known focal length get the one that the pairs among their photos vote for, and so do those
-    whose EXIF the pairs clearly contradict.
-
-    Returns:
-        The cameras, and one line on every focal length that is not what EXIF says.
-    """
-    out, notes = list(cameras), []
-
-    def vote_of(c: int, max_pairs: int) -> FocalVote | None:
-        images = camera_of_image == c
-        return calibrate_from_pairs(graph, cameras[c], images, options.two_view, seed, options.threads, max_pairs)
-
-    for c, camera in enumerate(cameras):
-        longer = max(camera.width, camera.height)
-        stated = float(camera.params[0]) / longer
-        if source[c] == "guess":
-            vote = vote_of(c, MAX_VOTING_PAIRS)
-            if vote is None or vote.contrast < MIN_VOTE_CONTRAST:
-                notes.append(
-                    f"focal length unknown, and the photos do not tell it: {stated:.2f} times the longer side, guessed"
-                )
-                continue
-        elif source[c] == "exif":
-            vote = vote_of(c, PAIRS_TO_CHECK_EXIF)
-            if vote is None or not contradicts(vote, camera):
-                continue
-            notes.append(
-                f"EXIF states a focal length of {stated:.2f} times the longer side, the photos agree on "
-                f"{vote.ratio:.2f}: EXIF is not used"
-            )
-        else:
-            continue
-        logger.info("focal length by vote: %.1f px, contrast %.2f", vote.ratio * longer, vote.contrast)
-        out[c] = replace(camera, params=np.array([vote.ratio * longer, *camera.principal_point]))
-    for note in notes:
-        logger.warning("%s", note)
-    return tuple(out), notes
-
-
-def contradicts(vote: FocalVote, camera: Camera) -> bool:
-    """Whether a vote is so clear, and so far from the camera's focal length, that the latter must be wrong."""
-    factor = vote.ratio * max(camera.width, camera.height) / float(camera.params[0])
-    return vote.contrast >= MIN_CONTRAST_AGAINST_EXIF and not 1.0 / MAX_EXIF_ERROR < factor < MAX_EXIF_ERROR
+def _are_of_many_cameras(infos: Sequence[PhotoInfo]) -> bool:
+    """Whether most photos that name their camera name different ones (or, if few do, most have sizes of their own):
+    the photos of many people."""
+    said: list = [info.exif.camera for info in infos if info.exif.camera is not None]
+    if len(said) < MIN_PHOTOS_OF_MANY:
+        said = [tuple(sorted((info.width, info.height))) for info in infos]
+    return len(said) >= MIN_PHOTOS_OF_MANY and len(set(said)) > SHARE_OF_MANY * len(said)
 
 
 def _given_camera(options: MatchingOptions, info: PhotoInfo) -> Camera:

@@ -21,10 +21,11 @@ from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
 from fieldstone.progress import OnProgress, silent
 from fieldstone.report.figures import PhotoByName
 from fieldstone.report.raster import DRAWN_PX
+from fieldstone.run.matching.calibration import calibrate
 from fieldstone.run.matching.detection import DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.pairs import match_pairs, verify
-from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions, vote_on_focal
+from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions
 from fieldstone.run.matching.static import without_static_content
 from fieldstone.scene.match_graph import MatchGraph
 
@@ -90,16 +91,18 @@ def match_photos(
         )
     infos = [photo.info for photo in photos]
     stop("features")
-    cameras, camera_of_image, source = cameras_of_photos(infos, options)
+    header = cameras_of_photos(infos, options)
     graph = _putative(photos, options, seed, cache, on_progress)
-    moving, static_notes = without_static_content(photos, graph, cameras, camera_of_image, options, seed)
+    moving, static_notes = without_static_content(photos, graph, header.cameras, header.camera_of_image, options, seed)
     if moving is not photos:
         photos, graph = moving, _putative(moving, options, seed, cache, on_progress)
     stop("matching")
-    cameras, notes = vote_on_focal(graph, cameras, camera_of_image, source, options, seed)
+    _, folder_of_photo = np.unique([str(info.path.parent) for info in infos], return_inverse=True)
+    found, notes = calibrate(graph, header, folder_of_photo, options, seed)
+    cameras, camera_of_image = found.cameras, found.camera_of_image
     graph = verify(graph, photos, cameras, camera_of_image, options, seed, cache, on_progress)
     stop("verification")
-    known = np.array([options.fix_intrinsics and s == "given" for s in source])
+    known = np.array([options.fix_intrinsics and source == "given" for source in found.source])
     photo_of = photos_on_disk([info.path for info in infos])
     sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
     return MatchedPhotos(
