@@ -26,6 +26,7 @@ from benchmarks.ground_truth import (
     read_strecha,
     read_transforms,
 )
+from benchmarks.made_sets import made_set
 from fieldstone.features.verification import verify_pairs
 from fieldstone.io.models.colmap import read_colmap
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
@@ -111,6 +112,11 @@ def _film(folder: Path) -> tuple[Input, Reconstruction | None]:
     return every_frame(DATA / "video/colosseum.mp4", 12, folder / "colosseum"), None
 
 
+def made(name: str, half: Half, expected: int) -> RealSet:
+    """One of `made_sets`, with its truth."""
+    return RealSet(name, half, expected, partial(made_set, name), "similar")
+
+
 def _strecha(name: str) -> Callable[[], Reconstruction]:
     return partial(read_strecha, DATA / name / "gt_dense_cameras")
 
@@ -168,6 +174,20 @@ SETS: tuple[RealSet, ...] = (
         "four_fold_alike", "confirm", 28,
         partial(four_fold_building, unique_share=0.05, max_view_change_deg=180.0), "similar",
     ),
+    made("plain_house", "develop", 12),
+    made("overlay", "develop", 12),
+    made("letterbox", "develop", 12),
+    made("turntable_rgba", "develop", 16),
+    made("exif_zoom_1_8", "develop", 12),
+    made("half_exif_wrong", "develop", 12),
+    made("mirrored_one", "develop", 11),
+    made("watermark", "confirm", 12),
+    made("turntable_background", "confirm", 16),
+    made("exif_right", "confirm", 12),
+    made("exif_zoom_1_8_stated", "confirm", 12),
+    made("exif_too_long", "confirm", 12),
+    made("ten_copies", "confirm", 12),
+    made("panorama_among", "confirm", 12),
     on_disk("odm_seneca_1200", "confirm", 167, "odm_seneca_1200/images", large=True),
 )  # fmt: skip
 

@@ -29,10 +29,10 @@ from fieldstone.errors import InputError
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import is_given_matches_folder
 from fieldstone.progress import silent
-from fieldstone.records.mapping import RunRecord
+from fieldstone.records.mapping import Grade
 from fieldstone.run.mapper_checkpoint import MapperCheckpoints
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos, match_photos, read_matched_photos
-from fieldstone.run.reconstruct import run_mapper, run_record
+from fieldstone.run.reconstruct import graded, run_mapper, run_record
 from fieldstone.run.reconstruct_options import ReconstructOptions
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
@@ -130,7 +130,7 @@ def reconstruct_set(each: RealSet, seed: int, keep: Path, threads: int) -> Outco
     except InputError as error:
         return Outcome(each.name, each.half, each.expected, seed, time.perf_counter() - start, refused=str(error))
     seconds = time.perf_counter() - start
-    record = run_record(Path(each.name), mapper, run, matched, seed, {})
+    record = run_record(Path(each.name), mapper, run, matched, graded(run, matched, options), seed, {})
     models = (run.reconstruction, *run.others)
     before, after = (verified(graph) for graph in (matched.graph, run.graph))
     loose = each.truth == "loose"
@@ -147,8 +147,8 @@ def reconstruct_set(each: RealSet, seed: int, keep: Path, threads: int) -> Outco
         errors=None if truth is None or loose else truth_errors(models[0], truth, cameras=each.truth != "poses"),
         counts=loose_counts(models, truth) if truth is not None and loose else None,
         metric=each.truth == "metric",
-        grade=grade_of(record),
-        notes=record.notes,
+        grade="" if record.grade is None else record.grade.word,
+        notes=(*record.notes, *(() if record.grade is None else grade_lines(record.grade))),
     )
 
 
@@ -179,10 +179,11 @@ def cameras_of(model: Reconstruction) -> str:
     return "; ".join(f"{c.model} {'/'.join(f'{f:.1f}' for f in dict.fromkeys(c.focal.tolist()))}" for c in found)
 
 
-def grade_of(record: RunRecord) -> str:
-    """The grade of the run, where it has one."""
-    grade = getattr(record, "grade", None)
-    return "" if grade is None else str(grade.word)
+def grade_lines(grade: Grade) -> list[str]:
+    """The numbers of a grade, and its reasons."""
+    shares = (grade.matches_kept, grade.error_added, grade.matches_turned)
+    numbers = "kept {}, error added {}, turned {}".format(*("-" if s is None else f"{s:.3f}" for s in shares))
+    return [f"grade {grade.word}: {numbers}", *(f"grade {r.word}: {r.reason}" for r in grade.reasons)]
 
 
 HEAD = (

@@ -15,7 +15,7 @@ from rich.table import Table
 from fieldstone.progress import OnProgress
 from fieldstone.progress import Progress as Event
 from fieldstone.records.field import FieldMetrics
-from fieldstone.records.mapping import RunRecord
+from fieldstone.records.mapping import Grade, RunRecord
 from fieldstone.records.shapes import MeshRecord, SplatRecord
 
 Source = Annotated[Path, tyro.conf.Positional]
@@ -77,6 +77,20 @@ def show_run(console: Console, record: RunRecord, out: Path) -> None:
             f"{summary.registered} of {summary.photos} photos, {summary.points} points, "
             f"{summary.observations} observations, mean error {summary.mean_px:.3f} px -> {out}",
             markup=False,
+        )
+    if record.grade is not None:
+        show_grade(console, record.grade)
+
+
+GRADE_STYLE = {"good": "green", "weak": "yellow", "doubtful": "red"}
+
+
+def show_grade(console: Console, grade: Grade) -> None:
+    """The grade, and a line for every reason with its advice."""
+    console.print(f"grade: {grade.word}", markup=False, style=GRADE_STYLE[grade.word])
+    for reason in grade.reasons:
+        console.print(
+            f"  {reason.word}: {reason.reason}; {reason.advice}", markup=False, style=GRADE_STYLE[reason.word]
         )
 
 

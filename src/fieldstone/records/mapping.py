@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -81,6 +82,49 @@ class DropRecord:
     observations: int
 
 
+GradeWord = Literal["good", "weak", "doubtful"]
+
+
+@dataclass(frozen=True)
+class GradeReason:
+    """One thing that speaks against a result."""
+
+    word: Literal["weak", "doubtful"]
+    """What it makes of the grade."""
+    reason: str
+    """With the numbers that decided."""
+    advice: str
+    """What to do about it."""
+
+
+@dataclass(frozen=True)
+class Grade:
+    """How far the first model can be believed, by an independent check after mapping; None where it had nothing to say.
+
+    The check asks the matches of pairs of photos again, without poses and focal lengths, and holds the model against
+    what they say.
+    """
+
+    word: GradeWord
+    """The worst of the reasons; good without any."""
+    reasons: tuple[GradeReason, ...]
+    """The gravest first."""
+    pairs: int = 0
+    """That were asked."""
+    matches_kept: float | None = None
+    """Share of their matches that the model explains."""
+    error_added: float | None = None
+    """Share of the variance of the matches' epipolar errors that their own geometry does not have; of the median."""
+    matches_turned: float | None = None
+    """Share of matches in pairs that would turn their cameras against each other, significantly."""
+    other_focal: tuple[str, ...] = ()
+    """Photos whose pairs want another focal length, significantly."""
+    contradicted: tuple[str, ...] = ()
+    """Photos whose pairs contradict their place."""
+    weakly_held: tuple[str, ...] = ()
+    """Photos that few points hold, or that alone hold parts of the model together."""
+
+
 @dataclass(frozen=True)
 class ModelSummary:
     """The numbers of a model that one looks at first; None where nothing is observed."""
@@ -136,5 +180,7 @@ class RunRecord:
     alternative: tuple[int, ...] = ()
     """Registered photos of the models of an alternative, which follow the others: where places look alike and the
     photos do not tell which is true."""
+    grade: Grade | None = None
+    """How far the first model can be believed."""
     truth: TruthErrors | None = field(default=None)
     """Where the photos are made, and the truth is known."""

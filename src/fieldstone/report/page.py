@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldstone.errors import InputError
 from fieldstone.records.field import CurvePoint, FieldMetrics
-from fieldstone.records.mapping import CameraRecord, ErrorRow, RunRecord, TruthErrors
+from fieldstone.records.mapping import CameraRecord, ErrorRow, GradeWord, RunRecord, TruthErrors
 from fieldstone.report.figure_store import FigureIndex, StoredFigure
 
 SECTIONS = (
@@ -33,6 +33,13 @@ SECTIONS = (
     ("field", "Radiance field", "A field learned from the posed photos, and views of it that no camera took."),
 )
 """Key, heading and introduction of the sections with figures, in the order of the page."""
+
+GRADE_MEANING: dict[GradeWord, str] = {
+    "good": "The matches of the photos, asked again without the model, agree with it.",
+    "weak": "The model may be right, but little holds some of it.",
+    "doubtful": "The matches of the photos contradict the model: do not rely on it.",
+}
+"""What a grade says, in a line."""
 
 FIGURES_IN_SIGHT = 2
 """Photo figures of one kind beyond these are folded."""
@@ -118,6 +125,7 @@ def render_page(title: str, story: Story, index: FigureIndex, folder: Path) -> s
         run=run,
         metrics=metrics,
         facts=_facts(run, metrics),
+        grade_meaning="" if run is None or run.grade is None else GRADE_MEANING[run.grade.word],
         photos=[] if run is None else _photos(run, index.thumbnails),
         sections=_sections(index),
         rows=rows,

@@ -14,8 +14,9 @@ from fieldstone import __version__
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import is_given_matches_folder
 from fieldstone.io.posed.model_photos import photos_of_model
+from fieldstone.mapping.grading.grade import grade_model
 from fieldstone.progress import OnProgress, Progress, silent
-from fieldstone.records.mapping import CameraRecord, DropRecord, PhotoVerdict, RunRecord
+from fieldstone.records.mapping import CameraRecord, DropRecord, Grade, PhotoVerdict, RunRecord
 from fieldstone.report.figures import PhotoByName, shrunk, thumbnails
 from fieldstone.run.folder import RunFolder
 from fieldstone.run.map_photos import ChosenMapper, map_given_matches, map_photos, map_with_textbook
@@ -118,8 +119,11 @@ def reconstructed(
     on_matched(photos.graph.names, photo_of)
     start = time.perf_counter()
     mapper, run = run_mapper(photos, options, MapperCheckpoints(cache), on_progress, given=given)
-    seconds = {**photos.seconds, "mapping": time.perf_counter() - start}
-    record = run_record(source, mapper, run, photos, options.seed, seconds)
+    mapped = time.perf_counter()
+    on_progress(Progress("grading"))
+    grade = graded(run, photos, options)
+    seconds = {**photos.seconds, "mapping": mapped - start, "grading": time.perf_counter() - mapped}
+    record = run_record(source, mapper, run, photos, grade, options.seed, seconds)
     posed = photos_of_model(run.reconstruction, source)
     return Scene(posed, record, Mapped(run, photo_of, source), options.masks)
 
@@ -148,8 +152,23 @@ def run_mapper(
     return mapping.mapper, map_photos(photos, options.matching(), mapping, seed, checkpoints, on_progress)
 
 
+def graded(run: MappingRun, photos: MatchedPhotos, options: ReconstructOptions) -> Grade:
+    """How far the first model can be believed, asked of the matches again."""
+    known = photos.known[: len(run.reconstruction.cameras)]
+    tuning, threads = options.tuning.grading, options.matching().threads
+    return grade_model(
+        run.reconstruction, run.graph, photos.graph, known, tuning, options.seed, threads, run.alternative
+    )
+
+
 def run_record(
-    source: Path, mapper: str, run: MappingRun, photos: MatchedPhotos, seed: int, seconds: Mapping[str, float]
+    source: Path,
+    mapper: str,
+    run: MappingRun,
+    photos: MatchedPhotos,
+    grade: Grade,
+    seed: int,
+    seconds: Mapping[str, float],
 ) -> RunRecord:
     """What `run.json` tells of a run."""
     model = run.reconstruction
@@ -170,6 +189,7 @@ def run_record(
         drops=tuple(DropRecord(drop.stage, drop.reason, drop.observations) for drop in run.drops),
         how_errors_are_counted=HOW_ERRORS_ARE_COUNTED,
         calibration=run.calibration,
+        grade=grade,
     )
 
 

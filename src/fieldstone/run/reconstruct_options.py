@@ -12,6 +12,7 @@ from fieldstone.errors import InputError
 from fieldstone.features.pairs import PairOptions
 from fieldstone.features.sift import SiftOptions
 from fieldstone.mapping.automatic import AutomaticOptions
+from fieldstone.mapping.grading.options import GradingOptions
 from fieldstone.mapping.textbook import TextbookOptions
 from fieldstone.run.matching.options import MatchingOptions, Sharing
 from fieldstone.run.options import NumbersOption, at_least, workers
@@ -32,6 +33,7 @@ class Tuning:
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     textbook: TextbookOptions = field(default_factory=TextbookOptions)
     mapping: AutomaticOptions = field(default_factory=AutomaticOptions)
+    grading: GradingOptions = field(default_factory=GradingOptions)
 
 
 @dataclass(frozen=True)

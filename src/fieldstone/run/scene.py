@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from fieldstone.errors import InputError
 from fieldstone.io.posed.open import open_posed_scene
 from fieldstone.io.posed.posed_scene import PosedScene
-from fieldstone.records.mapping import CameraTrial, ModelSummary, RunRecord
+from fieldstone.records.mapping import CameraTrial, Grade, ModelSummary, RunRecord
 from fieldstone.report.figure_store import write_figures
 from fieldstone.report.figures import PhotoByName, mapping_figures, thumbnails
 from fieldstone.report.page import Story
@@ -112,6 +112,11 @@ class Scene:
     def calibration(self) -> tuple[CameraTrial, ...]:
         """Camera models that were tried on the first model, and what held-out observations say of them."""
         return () if self.record is None else self.record.calibration
+
+    @property
+    def grade(self) -> Grade | None:
+        """How far the first model can be believed, with reasons and advice. None if the scene was not made here."""
+        return None if self.record is None else self.record.grade
 
     @property
     def notes(self) -> tuple[str, ...]:
