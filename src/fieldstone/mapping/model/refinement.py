@@ -48,8 +48,8 @@ class RefinementOptions:
     """The last adjustments; residuals of SIFT keypoints have heavy tails. The scale of the loss follows their noise.
     Reweighting converges slowly: steps that gain less move poses by a thousandth of their error."""
     min_views_for_intrinsics: int = 3
-    """Intrinsics are refined in adjustments of so many photos at least: those of a camera once so many of its photos are
-    among them, or all that it has."""
+    """Intrinsics are refined in adjustments of so many photos at least: those of a camera once so many of its photos
+    are among them, or all that it has."""
     max_rounds: int = 4
     """Rounds of adjustment and triangulation at the end."""
     threads: int = 1
