@@ -8,7 +8,7 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 from fieldstone.errors import InputError
-from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
+from fieldstone.io.images.masks import check_polarity, find_masks, inside_opaque, on_mean_colour, read_mask
 from fieldstone.io.images.photos import read_photo, read_photo_info, write_photo
 
 
@@ -88,3 +88,35 @@ def test_masks_that_keep_next_to_nothing_are_suspicious(caplog):
     assert "wrong way round" in caplog.text
     with pytest.raises(InputError, match="invert"):
         check_polarity([0.0, 0.0])
+
+
+def with_alpha(path, alpha, colours=90):
+    pixels = np.full((*alpha.shape, 4), colours, dtype=np.uint8)
+    pixels[..., 3] = alpha
+    pixels[alpha == 0, :3] = 7  # what is stored where nothing is shown
+    Image.fromarray(pixels).save(path, lossless=True)
+    return read_photo(path)
+
+
+@pytest.mark.parametrize("suffix", ["png", "webp", "tif"])
+def test_alpha_keeps_what_is_opaque_and_off_the_silhouette(tmp_path, suffix):
+    alpha = np.zeros((60, 80), dtype=np.uint8)
+    alpha[10:50, 20:70] = 255
+    alpha[10:50, 70] = 128  # a mixed edge
+    photo = with_alpha(tmp_path / f"a.{suffix}", alpha)
+    kept = inside_opaque(photo)
+    assert kept is not None
+    expected = np.zeros_like(kept)
+    expected[12:48, 22:68] = True  # two pixels off the outline
+    np.testing.assert_array_equal(kept, expected)
+    assert (on_mean_colour(photo) == 90).all()
+
+
+def test_opaque_photos_keep_everything(tmp_path, photo):
+    assert inside_opaque(read_photo(photo)) is None
+    assert inside_opaque(with_alpha(tmp_path / "a.png", np.full((6, 8), 255, dtype=np.uint8))) is None
+
+
+def test_a_photo_without_an_opaque_pixel_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no pixel opaque"):
+        inside_opaque(with_alpha(tmp_path / "a.png", np.full((6, 8), 100, dtype=np.uint8)))

@@ -276,3 +276,79 @@ def rewrite_focal(photos: Path, focal_35mm: float) -> None:
             exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = round(focal_35mm)
             image.load()
             image.save(path, exif=exif, quality=95)
+
+
+def with_exif(source: Path, target: Path, focal_35mm: int | None) -> None:
+    """The same pixels, with another focal length in EXIF."""
+    exif = Image.Exif()
+    if focal_35mm is not None:
+        exif[Base.Model] = "a camera"
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = focal_35mm
+    with Image.open(source) as image:
+        Image.fromarray(np.asarray(image)).save(target, exif=exif)
+
+
+def test_of_copies_with_other_exif_the_one_stays_that_says_what_most_photos_say(photos):
+    originals = sorted(photos.glob("*.jpg"))
+    for path in originals:
+        with_exif(path, path.with_suffix(".png"), 29)
+    for k, focal in enumerate((20, 29, 50, 80)):
+        with_exif(originals[2], photos / f"a_copy_{k}.png", focal)
+    for path in originals:
+        path.unlink()
+    found = matched(photos)
+    assert found.graph.names == (
+        "a_copy_1.png",
+        *(p.with_suffix(".png").name for k, p in enumerate(originals) if k != 2),
+    )
+    assert {problem.path.name for problem in found.problems} == {
+        "a_copy_0.png", "a_copy_2.png", "a_copy_3.png", originals[2].with_suffix(".png").name,
+    }  # fmt: skip
+    assert all(problem.reason.startswith("duplicate of a_copy_1.png") for problem in found.problems)
+    assert len(found.cameras) == 1
+
+
+def test_copies_of_which_no_exif_is_that_of_another_photo_have_none(photos):
+    originals = sorted(photos.glob("*.jpg"))
+    for path in originals:
+        with_exif(path, path.with_suffix(".png"), None)
+    for k, focal in enumerate((20, 50)):
+        with_exif(originals[2], photos / f"a_copy_{k}.png", focal)
+    for path in (*originals, originals[2].with_suffix(".png")):
+        path.unlink()
+    found = matched(photos)
+    assert "a_copy_0.png" in found.graph.names
+    assert len(found.cameras) == 1
+
+
+def as_panorama(path: Path) -> None:
+    xmp = b'<rdf:Description xmlns:GPano="x" GPano:ProjectionType="equirectangular"/>'
+    with Image.open(path) as image:
+        pixels = np.asarray(image)
+    Image.fromarray(pixels).save(path, xmp=xmp)
+
+
+def test_a_panorama_among_photos_is_skipped_and_many_are_refused(photos):
+    paths = sorted(photos.glob("*.jpg"))
+    as_panorama(paths[0])
+    found = matched(photos)
+    assert paths[0].name not in found.graph.names
+    assert [p.path.name for p in found.problems] == [paths[0].name]
+    assert "panorama" in found.problems[0].reason
+    for path in paths[1:4]:
+        as_panorama(path)
+    with pytest.raises(InputError, match="4 of 6 photos are panoramas"):
+        matched(photos)
+
+
+def test_alpha_is_a_mask(photos):
+    for path in sorted(photos.glob("*.jpg")):
+        with Image.open(path) as image:
+            pixels = np.asarray(image)
+        alpha = np.zeros(pixels.shape[:2], dtype=np.uint8)
+        alpha[:, : pixels.shape[1] // 2] = 255
+        Image.fromarray(np.dstack([pixels, alpha])).save(path.with_suffix(".png"))
+        path.unlink()
+    for photo in matched(photos).photos:
+        assert len(photo.features) > 50
+        assert photo.features.keypoints[:, 0].max() < photo.info.width // 2 - 1

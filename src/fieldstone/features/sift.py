@@ -82,7 +82,7 @@ class Sift:
             keep: Features whose centre lies elsewhere are left out before the strongest are chosen; None: none is.
         """
         height, width = image.shape[:2]
-        features = _no_features()
+        features = Features.none()
         for size in self.detection_sizes(width, height):
             features = self.detect(reduced_grey(image, size), image, (width, height), keep)
             if self.is_enough(features):
@@ -102,6 +102,10 @@ class Sift:
     def is_scarce(self, features: Features) -> bool:
         """Whether a photo shows so little that faint features are worth their time."""
         return len(features) < self.options.scarce and not self.is_enough(features)
+
+    def decides_otherwise(self, features: Features, rest: Features) -> bool:
+        """Whether a photo would have been searched more closely, had it shown only the rest of its features."""
+        return self.is_enough(features) > self.is_enough(rest) or self.is_scarce(rest) > self.is_scarce(features)
 
     def detect_faint(
         self, image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], keep: Bool[np.ndarray, "h w"] | None = None
@@ -143,7 +147,7 @@ class Sift:
         # In one call, since a pyramid costs as much as thousands of descriptors.
         found, described = detector.detectAndCompute(grey, None)
         if not found:
-            return _no_features()
+            return Features.none()
         # OpenCV: centre of the first pixel at (0, 0), diameters, degrees.
         xy = np.array([k.pt for k in found], dtype=np.float64) + 0.5
         radius = np.array([k.size for k in found], dtype=np.float64) / 2
@@ -152,7 +156,7 @@ class Sift:
 
         allowed = np.arange(len(xy)) if keep is None else np.flatnonzero(at_pixels(keep, xy * zoom))
         if not len(allowed):
-            return _no_features()
+            return Features.none()
         chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, self.options)]
         order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
         pixels = np.clip(xy[order] * zoom, 0.0, size)
@@ -224,13 +228,3 @@ def at_pixels(image: Shaped[np.ndarray, "h w *c"], pixels: Float[np.ndarray, "n 
     column = np.clip(pixels[:, 0].astype(np.int64), 0, image.shape[1] - 1)
     row = np.clip(pixels[:, 1].astype(np.int64), 0, image.shape[0] - 1)
     return image[row, column]
-
-
-def _no_features() -> Features:
-    return Features(
-        np.empty((0, 2)),
-        np.empty(0),
-        np.empty(0),
-        np.empty((0, 128), dtype=np.uint8),
-        np.empty((0, 3), dtype=np.uint8),
-    )

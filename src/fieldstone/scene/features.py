@@ -22,6 +22,12 @@ class Features:
     descriptors: UInt8[np.ndarray, "n d"]
     colors: UInt8[np.ndarray, "n 3"]
 
+    @staticmethod
+    def none() -> Features:
+        """Features of a photo that shows nothing."""
+        no_bytes = np.empty((0, 128), dtype=np.uint8)
+        return Features(np.empty((0, 2)), np.empty(0), np.empty(0), no_bytes, np.empty((0, 3), dtype=np.uint8))
+
     def __len__(self) -> int:
         return len(self.keypoints)
 

@@ -6,16 +6,21 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.io.images.photos import PHOTO_SUFFIXES, PhotoInfo, read_photo, read_photo_info, turned_upright
+from fieldstone.io.images.photos import PHOTO_SUFFIXES, Photo, PhotoInfo, read_photo, read_photo_info, turned_upright
 
 logger = logging.getLogger(__name__)
 
 MIN_WHITE = 128
 """Grey level from which a pixel is kept: the blacks of a JPEG are not all 0."""
+OPAQUE = 250
+"""Alpha from which a pixel is opaque: those of lossy formats are not all 255."""
+SILHOUETTE_PX, SILHOUETTE_SHARE = 2.0, 0.003
+"""How far pixels are kept off a silhouette's edge: in pixels, and as a share of the longer side, whichever is more."""
 MIN_KEPT = 0.05
 """Masks that keep a smaller share of their photos may have black and white the wrong way round."""
 
@@ -64,6 +69,35 @@ def read_mask(path: Path, photo: PhotoInfo) -> Bool[np.ndarray, "h w"]:
     if grey.shape != (photo.height, photo.width):
         raise InputError(f"{path}: the mask of {photo.path.name} has another size than the photo")
     return grey >= (MIN_WHITE if grey.max() > 1 else 1)
+
+
+def inside_opaque(photo: Photo) -> Bool[np.ndarray, "h w"] | None:
+    """Which pixels of a photo with alpha are opaque and off the silhouette's edge; None: all.
+
+    At the edge pixels are mixed of object and background, and the outline itself is another curve of the object from
+    every side.
+
+    Raises:
+        InputError: No pixel is.
+    """
+    if photo.alpha is None:
+        return None
+    opaque = photo.alpha >= OPAQUE
+    if opaque.all():
+        return None
+    margin = max(SILHOUETTE_PX, SILHOUETTE_SHARE * max(opaque.shape))
+    inside = cv2.distanceTransform(opaque.astype(np.uint8), cv2.DIST_L2, 5) > margin
+    if not inside.any():
+        raise InputError(f"{photo.info.path}: its alpha leaves no pixel opaque; save it without alpha")
+    return inside
+
+
+def on_mean_colour(photo: Photo) -> UInt8[np.ndarray, "h w 3"]:
+    """The photo with its mean colour where its alpha is not opaque: what is stored there is seen by nobody."""
+    rgb, alpha = photo.rgb, photo.alpha
+    if alpha is not None and (opaque := alpha >= OPAQUE).any():
+        rgb[~opaque] = rgb[opaque].mean(axis=0)
+    return rgb
 
 
 def check_polarity(kept: Sequence[float]) -> None:

@@ -23,6 +23,7 @@ from fieldstone.errors import InputError
 from fieldstone.io.files.atomic import replacing
 from fieldstone.io.images.exif import ExifFacts, exif_facts
 from fieldstone.io.images.heic import HAS_HEIC, HEIC_SUFFIXES, teach_pillow
+from fieldstone.io.images.panorama import is_panorama
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +77,8 @@ class PhotoInfo:
     orientation: int
     """EXIF orientation of the stored pixels, 1 to 8; reading turns them upright."""
     exif: ExifFacts
+    panorama: bool = False
+    """It is the picture of a sphere or a cylinder, see `panorama`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +223,7 @@ def _opened(path: Path, max_megapixels: float) -> Iterator[tuple[Image.Image, Ph
             try:
                 image = Image.open(file, formats=FORMATS)
                 orientation, facts = exif_facts(image)
+                panorama = is_panorama(image)
             except DAMAGE as error:
                 known = ", ".join(PHOTO_SUFFIXES)
                 raise InputError(f"{path}: not a photo that can be read ({_reason(error)}); read: {known}") from error
@@ -233,7 +237,7 @@ def _opened(path: Path, max_megapixels: float) -> Iterator[tuple[Image.Image, Ph
             )
         if orientation >= 5:
             width, height = height, width
-        yield image, PhotoInfo(path, width, height, orientation, facts)
+        yield image, PhotoInfo(path, width, height, orientation, facts, panorama)
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:

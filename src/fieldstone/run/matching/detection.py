@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,13 +19,15 @@ from fieldstone.errors import InputError
 from fieldstone.features.sift import Sift, reduced_grey
 from fieldstone.io.files.cache import Unit, UnitCache, code_version, file_hash, key_of
 from fieldstone.io.files.names import name_problem
-from fieldstone.io.images.masks import check_polarity, find_masks, read_mask
+from fieldstone.io.images.exif import ExifFacts
+from fieldstone.io.images.masks import check_polarity, find_masks, inside_opaque, on_mean_colour, read_mask
 from fieldstone.io.images.photos import PhotoInfo, PhotoProblem, read_photo, read_photo_info
 from fieldstone.progress import OnProgress, StageProgress, silent
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.scene.features import Features
 
 STAGE = "features"
+PANORAMA = "a panorama, as its XMP says: no camera that takes photos in a plane or through a fisheye sees so"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,7 @@ class DetectedPhoto:
     key: str
     """Hash of what the features depend on."""
     kept: float = 1.0
-    """Share of the pixels that the mask keeps."""
+    """Share of the pixels that its masks keep."""
     sharpness: float = 1.0
     """See `sharpness`."""
     mask: Path | None = None
@@ -50,17 +54,30 @@ class DetectedPhoto:
 
     def pixels(self) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
         """The photo, decoded, and which of its pixels are kept; None: all."""
-        keep = None if self.mask is None else read_mask(self.mask, self.info)
+        return self.pixels_to_search(None)
+
+    def pixels_to_search(
+        self, at_least_px: int | None
+    ) -> tuple[UInt8[np.ndarray, "_ _ 3"], Bool[np.ndarray, "h w"] | None]:
+        """`pixels`, the colours perhaps of a smaller picture, see `read_photo`."""
+        photo = read_photo(self.info.path, at_least_px=at_least_px)
+        masks = [] if self.mask is None else [read_mask(self.mask, self.info)]
+        if photo.alpha is not None and (opaque := inside_opaque(photo)) is not None:
+            masks.append(opaque)
         if self.static_cells is not None:
             size = self.info.width, self.info.height
-            moves = cv2.resize((~self.static_cells).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-            keep = moves if keep is None else keep & moves
-        return read_photo(self.info.path).rgb, keep
+            still = cv2.resize(self.static_cells.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+            masks.append(still == 0)
+        return on_mean_colour(photo), np.logical_and.reduce(masks) if masks else None
 
     def without(self, static: Bool[np.ndarray, "n"], cells: Bool[np.ndarray, "_ _"] | None) -> DetectedPhoto:
         """The photo without the features that do not move with the scene, and without cells in which nothing does."""
         key = key_of(self.key, np.packbits(static).tobytes().hex())
-        return replace(self, features=self.features[~static], key=key, static_cells=cells)
+        if cells is not None and self.static_cells is not None:
+            cells = cells | self.static_cells
+        return replace(
+            self, features=self.features[~static], key=key, static_cells=self.static_cells if cells is None else cells
+        )
 
 
 def detect(
@@ -107,59 +124,90 @@ def _detected(path: Path, mask: Path | None, extractor: Sift, cache: UnitCache) 
         unit, info = cache.find(STAGE, key), read_photo_info(path)
     except InputError as error:
         return _unusable(path, error)
+    if info.panorama:
+        return PhotoProblem(path, PANORAMA, "not used")
+    photo = DetectedPhoto(info, Features.none(), key, mask=mask)
     if unit is not None:
-        return DetectedPhoto(info, Features(**unit.arrays), key, mask=mask, **unit.facts)
-    keep = None if mask is None else read_mask(mask, info)
+        return replace(photo, features=Features(**unit.arrays), **unit.facts)
     try:
-        features, facts = _coarse_to_fine(extractor, info, keep)
+        return searched(photo, extractor, cache)
     except InputError as error:
         return _unusable(path, error)
-    facts |= {"kept": 1.0 if keep is None else float(keep.mean())}
-    cache.keep(STAGE, key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
-    return DetectedPhoto(info, features, key, mask=mask, **facts)
+
+
+def searched(photo: DetectedPhoto, extractor: Sift, cache: UnitCache) -> DetectedPhoto:
+    """The photo with the features that are found in what its masks keep; they go into the cache under its key."""
+    features, facts = _coarse_to_fine(extractor, photo)
+    cache.keep(STAGE, photo.key, Unit({f.name: getattr(features, f.name) for f in fields(Features)}, facts))
+    return replace(photo, features=features, **facts)
 
 
 def _without_copies(
     results: Sequence[DetectedPhoto | PhotoProblem],
 ) -> tuple[list[DetectedPhoto], list[PhotoProblem]]:
-    """The first of all photos with the same content, and the problems, to which its copies are added."""
+    """One of all photos with the same content, and the problems, to which its copies are added.
+
+    Copies whose files differ in what they say of the photo, and not in its pixels, have the same features: the one
+    stays that says the same as most photos. If none says what any other photo does, none is believed.
+    """
     problems = [result for result in results if isinstance(result, PhotoProblem)]
-    first: dict[str, DetectedPhoto] = {}
-    for photo in (result for result in results if isinstance(result, DetectedPhoto)):
-        if photo.key in first:
-            reason = f"duplicate of {first[photo.key].info.path.name}, byte for byte"
-            problems.append(PhotoProblem(photo.info.path, reason, "not used"))
-        else:
-            first[photo.key] = photo
-    return list(first.values()), problems
+    photos = [result for result in results if isinstance(result, DetectedPhoto)]
+    said = Counter(replace(photo.info.exif, gps=None) for photo in photos)
+
+    def agreeing(k: int) -> int:
+        return said[replace(photos[k].info.exif, gps=None)]
+
+    copies: dict[str, list[int]] = {}
+    for k, photo in enumerate(photos):
+        copies.setdefault(_content_of(photo), []).append(k)
+    kept: dict[int, DetectedPhoto] = {}
+    for same in copies.values():
+        chosen = max(same, key=lambda k: (agreeing(k), -k))
+        stays = photos[chosen]
+        if len({replace(photos[k].info.exif, gps=None) for k in same}) > 1 and agreeing(chosen) == 1:
+            stays = replace(stays, info=replace(stays.info, exif=ExifFacts(gps=stays.info.exif.gps)))
+        kept[chosen] = stays
+        for k in (k for k in same if k != chosen):
+            how = "byte for byte" if photos[k].key == stays.key else "pixel for pixel, though the files differ"
+            reason = f"duplicate of {stays.info.path.name}, {how}"
+            problems.append(PhotoProblem(photos[k].info.path, reason, "not used"))
+    return [kept[k] for k in sorted(kept)], problems
+
+
+def _content_of(photo: DetectedPhoto) -> str:
+    """A hash that photos with the same pixels share; of photos that show nothing, that of their files."""
+    features = photo.features
+    if not len(features):
+        return photo.key
+    arrays = [np.ascontiguousarray(array).tobytes() for array in (features.keypoints, features.descriptors)]
+    content = hashlib.blake2b(b"".join(arrays), digest_size=16).hexdigest()
+    return f"{photo.info.width} x {photo.info.height}, {content}"
 
 
 def _unusable(path: Path, error: InputError) -> PhotoProblem:
     return PhotoProblem(path, str(error).removeprefix(f"{path}: "))
 
 
-def _coarse_to_fine(
-    extractor: Sift, info: PhotoInfo, keep: Bool[np.ndarray, "h w"] | None
-) -> tuple[Features, dict[str, Any]]:
-    """Features of a photo, its sharpness at the coarse size, and whether faint ones had to be taken.
+def _coarse_to_fine(extractor: Sift, photo: DetectedPhoto) -> tuple[Features, dict[str, Any]]:
+    """Features of a photo, and other facts: see `DetectedPhoto`.
 
     It is decoded no larger than each size needs.
     """
-
-    def detect_at(size: int) -> tuple[Features, float]:
-        image = read_photo(info.path, at_least_px=size).rgb
-        grey = reduced_grey(image, size)
-        return extractor.detect(grey, image, (info.width, info.height), keep), sharpness(grey)
-
-    coarse, *finer = extractor.detection_sizes(info.width, info.height)
-    features, sharp = detect_at(coarse)
-    for size in finer:
+    size = photo.info.width, photo.info.height
+    coarse, *finer = extractor.detection_sizes(*size)
+    image, keep = photo.pixels_to_search(coarse)
+    grey = reduced_grey(image, coarse)
+    features, sharp = extractor.detect(grey, image, size, keep), sharpness(grey)
+    for fine in finer:
         if not extractor.is_enough(features):
-            features, _ = detect_at(size)
+            image, keep = photo.pixels_to_search(fine)
+            features = extractor.detect(reduced_grey(image, fine), image, size, keep)
     scarce = extractor.is_scarce(features)
     if scarce:
-        features = extractor.detect_faint(read_photo(info.path).rgb, (info.width, info.height), keep)
-    return features, {"sharpness": sharp, "faint": scarce}
+        image, keep = photo.pixels_to_search(None)
+        features = extractor.detect_faint(image, size, keep)
+    kept = 1.0 if keep is None else float(keep.mean())
+    return features, {"sharpness": sharp, "faint": scarce, "kept": kept}
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,11 @@ from fieldstone.progress import OnProgress, silent
 from fieldstone.report.figures import PhotoByName
 from fieldstone.report.raster import DRAWN_PX
 from fieldstone.run.matching.calibration import calibrate
-from fieldstone.run.matching.detection import DetectedPhoto, detect
+from fieldstone.run.matching.detection import PANORAMA, DetectedPhoto, detect
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.pairs import match_pairs, verify
 from fieldstone.run.matching.photo_cameras import cameras_of_photos, gps_positions
-from fieldstone.run.matching.static import without_static_content
+from fieldstone.run.matching.static import leave_out_static_content
 from fieldstone.scene.match_graph import MatchGraph
 
 logger = logging.getLogger(__name__)
@@ -77,10 +77,12 @@ def match_photos(
     """Features of every photo, matches of every pair, focal lengths where nobody knows them, two-view geometry.
 
     Raises:
-        InputError: Fewer than two photos can be read.
+        InputError: Fewer than two photos can be read, or most of them are panoramas.
     """
     stop, seconds = _stopwatch()
-    photos, problems = detect(list_photos(folder), options, cache, on_progress)
+    paths = list_photos(folder)
+    photos, problems = detect(paths, options, cache, on_progress)
+    _refuse_panoramas(folder, problems, len(paths))
     for problem in problems:
         logger.warning("skipped %r: %s", problem.path.name, problem.reason)
     if len(photos) < 2:
@@ -92,10 +94,9 @@ def match_photos(
     infos = [photo.info for photo in photos]
     stop("features")
     header = cameras_of_photos(infos, options)
-    graph = _putative(photos, options, seed, cache, on_progress)
-    moving, static_notes = without_static_content(photos, graph, header.cameras, header.camera_of_image, options, seed)
-    if moving is not photos:
-        photos, graph = moving, _putative(moving, options, seed, cache, on_progress)
+    match = partial(_putative, options=options, seed=seed, cache=cache, on_progress=on_progress)
+    of_photo = [header.cameras[c] for c in header.camera_of_image.tolist()]
+    photos, graph, static_notes = leave_out_static_content(photos, match, of_photo, options, seed, cache)
     stop("matching")
     _, folder_of_photo = np.unique([str(info.path.parent) for info in infos], return_inverse=True)
     found, notes = calibrate(graph, header, folder_of_photo, options, seed)
@@ -117,6 +118,16 @@ def match_photos(
         sharpness,
         [*static_notes, *notes],
     )
+
+
+def _refuse_panoramas(folder: Path, problems: Sequence[PhotoProblem], num_files: int) -> None:
+    """One line for all of them, where most photos are panoramas."""
+    panoramas = sum(problem.reason == PANORAMA for problem in problems)
+    if panoramas > num_files / 2:
+        raise InputError(
+            f"{folder}: {panoramas} of {num_files} photos are panoramas, as their XMP says, and there is no camera "
+            "model for these: cut ordinary views out of them, or give ordinary photos"
+        )
 
 
 def _putative(
