@@ -72,6 +72,19 @@ def test_unknown_cameras_are_calibrated_by_their_own_photos():
     assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.3, relative_distance=0.005)
 
 
+def test_photos_that_share_no_camera_are_calibrated_each_on_its_own():
+    """One lens took them all, and nobody knows: every photo starts with a focal length of its own, up to 8 % off."""
+    scene = scene_of(
+        num_points=1000, noise_px=0.3, camera=Camera("PINHOLE", 1000, 750, np.array([800.0, 800, 500, 375]))
+    )
+    off = np.linspace(0.92, 1.08, 8)
+    cameras = tuple(Camera("SIMPLE_PINHOLE", 1000, 750, np.array([800.0 * share, 500.0, 375.0])) for share in off)
+    graph = verify_pairs(scene.graph, cameras, np.arange(8), TwoViewOptions(), 0, 2)
+    run = map_automatic(graph, cameras, np.arange(8), np.zeros(8, dtype=bool), AutomaticOptions(), 0)
+    found = np.array([camera.focal.mean() for camera in run.reconstruction.cameras])
+    np.testing.assert_allclose(found / 800, 1.0, atol=0.01)
+
+
 def test_result_is_the_same_for_any_number_of_threads(monkeypatch):
     scene = scene_of(outlier_share=0.2)
     camera_of_image, known = np.zeros(8, dtype=np.int64), np.array([False])

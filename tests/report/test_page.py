@@ -123,7 +123,12 @@ def run_record(run) -> RunRecord:
         seconds={"read_photos": 1.25, "map": 62.0},
         summary=summary_of(run.reconstruction, 5),
         components=(4, 2),
-        cameras=(CameraRecord("PINHOLE", 1000, 750, (800.0, 810.5, 505.0, 370.0)),),
+        cameras=(
+            CameraRecord("PINHOLE", 1000, 750, (800.0, 810.5, 505.0, 370.0)),
+            CameraRecord(
+                "SIMPLE_RADIAL", 90, 60, (80.0, 45.0, 30.0, 0.1), (0.25, None, None, 0.01), "weak", "<b>few</b> points"
+            ),
+        ),
         notes=("focal <length> from EXIF of 3 photos",),
         photos=(*verdicts, PhotoVerdict(NASTY[5], False, "not registered: sees 3 points", 0)),
         table=tuple(record.row() for record in run.records),
@@ -224,7 +229,9 @@ def test_key_numbers_and_verdicts_stand_first(folder):
     ):
         assert part in text
     assert "focal <length> from EXIF" in text
-    assert "800, 810.5, 505, 370" in text
+    assert "fx 800, fy 810.5, cx 505, cy 370" in text
+    assert "f 80 ± 0.25, cx 45, cy 30, k 0.1 ± 0.01" in text
+    assert "weak: <b>few</b> points" in text
     assert "/home/someone" not in page_of(folder)  # where a run's photos lay is nobody's business
 
 

@@ -64,7 +64,7 @@ def test_a_photo_whose_pairs_were_not_chosen_is_registered(scene):
     assert [sub_model.num_registered for sub_model in before.sub_models] == [5]
     rematcher = Rematcher(detected_photos(scene), ONE_CAMERA, OPTIONS, 0)
     after = recover(before, [rematcher.other_pairs], options.incremental, 0)
-    run = finish_all(after, cameras, ONE_CAMERA, options, 0)
+    run = finish_all(after, cameras, ONE_CAMERA, options)
     assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.2, relative_distance=0.005)
     assert run.verdicts[graph.names[LAST]].startswith("registered")
 

@@ -219,6 +219,42 @@ def test_priors_pull_and_bounds_hold():
         assert bounded.final_cost == pytest.approx(held.final_cost, rel=1e-6)
 
 
+def test_priors_on_ratios_tie_two_parameters():
+    """In a view's own block and in the border: the minimum has no lower neighbour, and a vague prior says nothing."""
+    problem = perturbed(mixed_problem(fixed=False))
+    free = bundle_adjust(problem, TIGHT).problem
+    for camera in (1, 2):
+        prior = CameraPrior(camera, 0, mean=3.0, sigma=1e-2, of=1, ratio=1.1)
+
+        def cost(at: BundleProblem, camera: int = camera) -> float:
+            fx, fy = at.cameras[camera].params[:2]
+            return cost_of(at) + 0.5 * ((fx - 1.1 * fy - 3.0) / 1e-2) ** 2
+
+        tied = bundle_adjust(problem, replace(TIGHT, camera_priors=(prior,)))
+        params = tied.problem.cameras[camera].params
+        assert params[0] == pytest.approx(1.1 * params[1] + 3.0, abs=0.05)
+        assert tied.final_cost == pytest.approx(cost(tied.problem), rel=1e-9)
+        for step in ([1.1, 1.0], [-1.1, -1.0], [1.0, 0.0], [0.0, 1.0]):
+            moved = list(tied.problem.cameras)
+            moved[camera] = replace(moved[camera], params=params + 1e-2 * np.pad(step, (0, len(params) - 2)))
+            assert cost(replace(tied.problem, cameras=tuple(moved))) > tied.final_cost
+        vague = bundle_adjust(problem, replace(TIGHT, camera_priors=(replace(prior, sigma=1e9),))).problem
+        np.testing.assert_allclose(vague.cameras[camera].params, free.cameras[camera].params, rtol=1e-5)
+
+
+def test_a_prior_on_a_ratio_leaves_a_parameter_at_its_bound_there():
+    problem = perturbed(mixed_problem(fixed=False))
+    for camera in (1, 2):
+        start = problem.cameras[camera].params
+        upper = float(start[0])
+        options = replace(TIGHT, camera_priors=(
+            CameraPrior(camera, 0, mean=100.0, sigma=1e-2, upper=upper, of=1), CameraPrior(camera, 1, lower=start[1])
+        ))  # fmt: skip
+        found = bundle_adjust(problem, options).problem.cameras[camera].params
+        assert found[0] == pytest.approx(upper, abs=1e-9)
+        assert found[1] == pytest.approx(start[1], abs=1e-6)
+
+
 def test_prior_is_part_of_the_cost():
     problem = mixed_problem()
     prior = CameraPrior(0, 0, mean=problem.cameras[0].params[0] + 10.0, sigma=2.0)

@@ -25,7 +25,7 @@ from fieldstone.mapping.incremental.merging import merge_linked
 from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.incremental.registration import verdict_of_pairs
 from fieldstone.mapping.incremental.state import SubModel
-from fieldstone.mapping.model.calibration import CalibrationStep, first_step, with_models
+from fieldstone.mapping.model.calibration import CalibrationStep, first_step, what_is_wrong_with, with_models
 from fieldstone.mapping.model.outliers import drop_outliers
 from fieldstone.mapping.model.refinement import (
     RefinementOptions,
@@ -33,12 +33,12 @@ from fieldstone.mapping.model.refinement import (
     loss_scale,
     refine_until_stable,
 )
-from fieldstone.mapping.model.uncertainty import model_uncertainty
+from fieldstone.mapping.model.uncertainty import camera_certainties, model_uncertainty
 from fieldstone.mapping.model.working_model import WorkingModel, record_views, to_reconstruction
 from fieldstone.mapping.self_calibration import CalibrationTrial, SelfCalibrationOptions, select_camera_models
 from fieldstone.mapping.textbook import four_poses
 from fieldstone.progress import OnProgress, StageProgress, silent
-from fieldstone.records.mapping import CameraTrial
+from fieldstone.records.mapping import CameraRecord, CameraTrial
 from fieldstone.scene.mapping_run import Drop, MappingRun, Uncertainty
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.tracks import Observations
@@ -100,7 +100,7 @@ def map_automatic(
         on_progress: Told of registered photos and finished models.
     """
     found = place(graph, cameras, camera_of_image, known, options, seed, store, on_progress)
-    return finish_all(found, cameras, camera_of_image, options, seed, on_progress)
+    return finish_all(found, cameras, camera_of_image, options, on_progress)
 
 
 def place(
@@ -144,7 +144,6 @@ def finish_all(
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
     options: AutomaticOptions,
-    seed: int,
     on_progress: OnProgress = silent,
 ) -> MappingRun:
     """Every sub-model finished, and the run that tells of them.
@@ -153,10 +152,7 @@ def finish_all(
         cameras: As given, before anything was refined.
     """
     progress = StageProgress(on_progress, "finishing models", len(found.sub_models) + len(found.alternative))
-    finished = [
-        finish(sub_model, options, np.random.default_rng([seed, k]))
-        for k, sub_model in enumerate(progress.each([*found.sub_models, *found.alternative]))
-    ]
+    finished = [finish(each, options) for each in progress.each([*found.sub_models, *found.alternative])]
     count = len(found.sub_models)
     run = to_mapping_run(found.graph, found.sub_models, finished[:count], cameras, camera_of_image, options)
     return with_disambiguation(run, found, [other.model for other in finished[count:]])
@@ -181,12 +177,38 @@ def with_disambiguation(run: MappingRun, found: Disambiguation, alternative: Seq
     )
 
 
-def finish(sub_model: SubModel, options: AutomaticOptions, rng: np.random.Generator) -> FinishedModel:
-    """Self-calibration, then adjustment of everything with everything."""
+def finish(sub_model: SubModel, options: AutomaticOptions) -> FinishedModel:
+    """Self-calibration, then adjustment of everything with everything.
+
+    A camera model that was chosen on a part of the tracks, and that all of them make no lens, is given up.
+    """
+    refinement = options.incremental.refinement.for_noise(loss_scale(sub_model.model))
+    first = tuple(sub_model.calibration)
+    calibration, trials = select_camera_models(sub_model.model, first, refinement, options.self_calibration)
+    found = _adjusted(sub_model, calibration, trials, refinement, options)
+    wrong = next((w for w in map(_wrong_with, found.model.cameras, found.calibration) if w), "")
+    if calibration == first or not wrong:
+        return found
+    logger.warning("the camera model that was chosen is given up: %s", wrong)
+    refused = [replace(trial, accepted=False, verdict=wrong) if trial.accepted else trial for trial in trials]
+    return _adjusted(sub_model, first, refused, refinement, options)
+
+
+def _wrong_with(camera: Camera, step: CalibrationStep | None) -> str:
+    """Why no lens is like a camera that was refined; "" if there is nothing."""
+    return "" if step is None else what_is_wrong_with(camera, step)
+
+
+def _adjusted(
+    sub_model: SubModel,
+    calibration: tuple[CalibrationStep | None, ...],
+    trials: Sequence[CalibrationTrial],
+    refinement: RefinementOptions,
+    options: AutomaticOptions,
+) -> FinishedModel:
+    """Everything adjusted with everything, in the camera models of a calibration."""
     incremental, before = options.incremental, sub_model.model
     limits = incremental.max_error_px, options.min_angle_deg
-    refinement = incremental.refinement.for_noise(loss_scale(before))
-    calibration, trials = select_camera_models(before, sub_model.calibration, refinement, options.self_calibration, rng)
     model = refine_until_stable(before, refinement, calibration, *limits, bundle=refinement.final, all_points=True)
     model, drops = drop_outliers(model, "end", *limits)
     model = adjust_globally(model, refinement, calibration, bundle=refinement.final, points=model.is_point())
@@ -215,6 +237,8 @@ def to_mapping_run(
     start_cameras = with_models(cameras, first.calibration)
     uncertainty, notes = _uncertainty(best) if options.covariance else (None, ())
     trials = tuple(_record(trial) for trial in best.trials)
+    certainties = camera_certainties(best.model, best.calibration, best.refinement)
+    cameras_found = [CameraRecord.of(*each) for each in zip(best.model.cameras, certainties, strict=True)]
     return MappingRun(
         reconstruction=to_reconstruction(best.model, graph),
         graph=graph,
@@ -224,9 +248,10 @@ def to_mapping_run(
         before_bundle=to_reconstruction(best.before, graph),
         verdicts=verdicts,
         others=tuple(to_reconstruction(other.model, graph) for other in finished[1:]),
-        notes=(*(_describe(trial) for trial in trials), *(_describe_camera(c) for c in best.model.cameras), *notes),
+        notes=(*(_describe(trial) for trial in trials), *(_describe_camera(c) for c in cameras_found), *notes),
         uncertainty=uncertainty,
         calibration=trials,
+        certainties=certainties,
     )
 
 
@@ -263,20 +288,21 @@ def _record(trial: CalibrationTrial) -> CameraTrial:
         rms_after_px=float(trial.rms_after_px),
         significance=float(trial.significance),
         accepted=bool(trial.accepted),
+        verdict=trial.verdict,
     )
 
 
 def _describe(trial: CameraTrial) -> str:
     """One line on one camera model that was tried."""
-    verdict = "accepted" if trial.accepted else "refused"
+    verdict = "taken" if trial.accepted else "refused"
     return (
         f"calibration {trial.model} with {', '.join(trial.free)} free: held-out observations predicted to "
-        f"{trial.rms_after_px:.4f} px instead of {trial.rms_before_px:.4f} px "
-        f"({trial.significance:+.1f} standard errors), {verdict}"
+        f"{trial.rms_after_px:.4f} px, the simplest model to {trial.rms_before_px:.4f} px "
+        f"({trial.significance:+.1f} standard errors), {verdict}: {trial.verdict}"
     )
 
 
-def _describe_camera(camera: Camera) -> str:
+def _describe_camera(camera: CameraRecord) -> str:
     """One line on the intrinsics that a model ended with."""
-    values = ", ".join(f"{n} {v:.6g}" for n, v in zip(camera.spec.param_names, camera.params, strict=True))
-    return f"camera {camera.model}: {values}"
+    certainty = "" if camera.certainty is None else f"; {camera.certainty}: {camera.reason}"
+    return f"camera {camera.model}: {camera.params_with_sds()}{certainty}"

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from fieldstone.geometry.camera import Camera
+from fieldstone.geometry.camera_models import CAMERA_MODELS
+
+Certainty = Literal["well determined", "weak", "assumed"]
+"""Of a camera's intrinsics."""
+
+
+@dataclass(frozen=True)
+class CameraCertainty:
+    """How well the photos determine a camera."""
+
+    sds: tuple[float | None, ...]
+    """Standard deviation of every parameter, in the order of the model; None where it was held."""
+    word: Certainty
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -19,11 +33,29 @@ class CameraRecord:
     width: int
     height: int
     params: tuple[float, ...]
+    sds: tuple[float | None, ...] = ()
+    """Standard deviation of every parameter; None where it was held, empty where nothing is known of it."""
+    certainty: Certainty | None = None
+    """How well the photos determine the camera."""
+    reason: str = ""
+    """Why that is said."""
 
     @staticmethod
-    def of(camera: Camera) -> CameraRecord:
+    def of(camera: Camera, certainty: CameraCertainty | None = None) -> CameraRecord:
         """What is written of a camera."""
-        return CameraRecord(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
+        record = CameraRecord(camera.model, camera.width, camera.height, tuple(camera.params.tolist()))
+        if certainty is None:
+            return record
+        return replace(record, sds=certainty.sds, certainty=certainty.word, reason=certainty.reason)
+
+    def params_with_sds(self) -> str:
+        """Parameters by name, with their standard deviations where these are known."""
+        sds = self.sds or (None,) * len(self.params)
+        names = CAMERA_MODELS[self.model].param_names
+        return ", ".join(
+            f"{name} {value:.6g}" + ("" if sd is None else f" ± {sd:.2g}")
+            for name, value, sd in zip(names, self.params, sds, strict=True)
+        )
 
     def camera(self) -> Camera:
         """The camera."""
@@ -66,11 +98,13 @@ class CameraTrial:
     free: tuple[str, ...]
     """Names of the parameters that were refined."""
     rms_before_px: float
-    """Robust root mean square of prediction by the best model before it."""
+    """Robust root mean square of prediction by the simplest model."""
     rms_after_px: float
     significance: float
     """Of the gain, in standard errors."""
     accepted: bool
+    verdict: str = ""
+    """Why, or why not."""
 
 
 @dataclass(frozen=True)

@@ -221,10 +221,11 @@ def _stage_totals(rows: Sequence[ErrorRow]) -> list[_StageTotal]:
     return out
 
 
-def _camera(camera: CameraRecord) -> tuple[str, str, str]:
-    """Model, size in pixels and parameters of a camera."""
+def _camera(camera: CameraRecord) -> tuple[str, str, str, str]:
+    """Model, size in pixels, parameters of a camera, and how certain they are."""
     size = f"{_number(camera.width, 0)} × {_number(camera.height, 0)}"
-    return camera.model, size, ", ".join(f"{p:.6g}" for p in camera.params)
+    certainty = "–" if camera.certainty is None else f"{camera.certainty}: {camera.reason}"
+    return camera.model, size, camera.params_with_sds(), certainty
 
 
 def _timings(run: RunRecord | None, metrics: FieldMetrics | None) -> list[tuple[str, float]]:

@@ -52,7 +52,7 @@ def map_photos(
     if matched.photos and not found.left_out.any():  # matching anew would find again what was left out
         stages = Rematcher(matched.photos, camera_of_image, matching, seed).stages()
         found = recover(found, stages, options.incremental, seed, store, on_progress)
-    return finish_all(found, cameras, camera_of_image, options, seed, on_progress)
+    return finish_all(found, cameras, camera_of_image, options, on_progress)
 
 
 def map_given_matches(
@@ -77,7 +77,7 @@ def map_given_matches(
     found = place(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
     if mapper == "auto" and not found.notes:
         return "textbook", map_with_textbook(matched, textbook, seed, on_progress)
-    return options.mapper, finish_all(found, cameras, camera_of_image, options, seed, on_progress)
+    return options.mapper, finish_all(found, cameras, camera_of_image, options, on_progress)
 
 
 def map_with_textbook(

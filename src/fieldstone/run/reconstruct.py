@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +183,9 @@ def run_record(
         summary=summary_of(model, len(verdicts)),
         components=sizes_of((model, *run.others)),
         alternative=sizes_of(run.alternative),
-        cameras=tuple(CameraRecord.of(camera) for camera in model.cameras),
+        cameras=tuple(
+            CameraRecord.of(camera, certainty) for camera, certainty in zip_longest(model.cameras, run.certainties)
+        ),
         notes=(*photos.notes, *run.notes),
         photos=verdicts,
         table=tuple(record.row() for record in run.records),

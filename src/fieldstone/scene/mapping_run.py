@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fieldstone.geometry.rigid3 import Rigid3
-from fieldstone.records.mapping import CameraTrial, ErrorRow
+from fieldstone.records.mapping import CameraCertainty, CameraTrial, ErrorRow
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -102,3 +102,5 @@ class MappingRun:
     """Of the reconstruction, if it was asked for."""
     calibration: tuple[CameraTrial, ...] = ()
     """Camera models that were tried on the reconstruction, in order."""
+    certainties: tuple[CameraCertainty, ...] = ()
+    """Of the reconstruction's cameras, where the mapper tells it."""

@@ -10,24 +10,67 @@ from jaxtyping import Bool
 
 from fieldstone.geometry.camera import Camera, plane_from_image
 from fieldstone.geometry.camera_models import CAMERA_MODELS
+from fieldstone.geometry.lens import corner_radius, is_invertible, sees_like_a_fisheye
 from fieldstone.solve.bundle.camera_prior import CameraPrior
 
-PRINCIPAL_POINT_SIGMA = 0.02
-"""Standard deviation of the principal point about the centre of the photo, as a share of the longer side."""
+PRINCIPAL_POINT_SIGMA = 0.01
+"""Standard deviation of the principal point about where it is taken to be, as a share of the longer side."""
+ASPECT_SIGMA = 0.002
+"""Of the ratio of the two focal lengths about the one given: pixels of photos are square."""
+FREE_ASPECT_SIGMA = 0.2
+"""The same where pixels may be of another shape."""
+RADIAL_SIGMA = 0.1
+"""By what share of its distance from the centre a radial term moves the corner of the photo."""
+TANGENTIAL_SIGMA = 0.005
+"""The same of a tangential term."""
+FOCAL_SIGMA = 0.3
+"""Of a focal length about its start, as a share, where nothing better is known of the start."""
 FOCAL_RANGE = 2.0
 """A focal length stays within this factor of its start."""
-LARGEST_COEFFICIENT = 1.0
-"""Distortion coefficients beyond it describe no lens."""
+LARGEST_DISTORTION = 1.0
+"""No term moves the corner of the photo by more than this share of its distance from the centre."""
+NEAR_BOUND = 0.01
+"""A parameter is at a bound when it is nearer to it than this share of the interval."""
 SAME_FOCAL = 1e-6
 """Focal lengths of the two axes that differ by a smaller share are one."""
+
+CENTER = ("cx", "cy")
+POWER_OF_RADIUS = {"k": 2, "k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6, "p1": 1, "p2": 1}
+"""A coefficient times so many powers of the radius is a share of the radius; k4 of a fisheye lens is another."""
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """What is known of a camera before its photos are mapped, beside what all cameras have in common."""
+
+    focal: float = 1.0
+    """Mean focal length in pixels, give or take a share `focal_sigma`."""
+    focal_sigma: float = np.inf
+    aspect: float = 1.0
+    """Ratio fx / fy, give or take a share `aspect_sigma`."""
+    aspect_sigma: float = ASPECT_SIGMA
+    center: tuple[float, float] | None = None
+    """Principal point in pixels; None: the centre of the photo."""
+
+    @staticmethod
+    def of(camera: Camera, focal_sigma: float = FOCAL_SIGMA) -> LensPrior:
+        """That of a camera that is given, not exactly.
+
+        Args:
+            focal_sigma: How far its focal length may be off, as a share: a standard deviation.
+        """
+        fx, fy = camera.focal.tolist()
+        cx, cy = camera.principal_point.tolist()
+        return LensPrior((fx + fy) / 2.0, focal_sigma, fx / fy, center=(cx, cy))
 
 
 @dataclass(frozen=True)
 class CalibrationStep:
-    """A camera model and the names of its parameters that are refined."""
+    """A camera model, the names of its parameters that are refined, and what is known of the lens."""
 
     model: str
     free: tuple[str, ...]
+    prior: LensPrior = LensPrior()
 
     def mask(self) -> Bool[np.ndarray, "p"]:
         """Which parameters are refined, in the order of the model."""
@@ -58,9 +101,14 @@ FISHEYE_RADII = 200
 """Radii at which a fisheye model is fitted to another one."""
 
 
-def first_step(camera: Camera) -> CalibrationStep:
-    """The first of `FIRST_STEPS` whose model expresses the camera as it is."""
-    return next(step for step in FIRST_STEPS if _expresses(step.model, camera))
+def first_step(camera: Camera, focal_sigma: float = FOCAL_SIGMA) -> CalibrationStep:
+    """The first of `FIRST_STEPS` whose model expresses the camera as it is; the camera is its prior.
+
+    Args:
+        focal_sigma: How far the focal length may be off, as a share: a standard deviation.
+    """
+    step = next(step for step in FIRST_STEPS if _expresses(step.model, camera))
+    return replace(step, prior=LensPrior.of(camera, focal_sigma))
 
 
 def richer_steps(step: CalibrationStep, *, principal_point: bool = True) -> list[CalibrationStep]:
@@ -71,12 +119,12 @@ def richer_steps(step: CalibrationStep, *, principal_point: bool = True) -> list
     """
     order = [other.model for other in CANDIDATE_STEPS]
     at_least = order.index(step.model)
-    return [
-        other
-        for k, other in enumerate(CANDIDATE_STEPS)
-        if k >= at_least and not (other.model == step.model and set(other.free) <= set(step.free))
-        if principal_point or "cx" not in other.free
-    ]
+    out: list[CalibrationStep] = []
+    for other in CANDIDATE_STEPS[at_least:]:
+        richer = replace(other if principal_point else with_held_center(other), prior=step.prior)
+        if not (other.model == step.model and set(richer.free) <= set(step.free)) and richer not in out:
+            out.append(richer)
+    return out
 
 
 def as_model(camera: Camera, model: str) -> Camera:
@@ -147,23 +195,77 @@ def _as_fisheye(camera: Camera) -> Camera:
 
 
 def priors(cameras: Sequence[Camera], calibration: Sequence[CalibrationStep | None]) -> tuple[CameraPrior, ...]:
-    """What is known of the refined parameters: focal lengths and coefficients are bounded, principal points near the
-    centre."""
-    out = []
+    """What is known of the refined parameters: focal lengths and distortion are bounded, pixels about square, principal
+    points near the centre, distortion small.
+
+    They are vague beside the observations of photos that determine a camera, and decide where photos do not.
+    """
+    out: list[CameraPrior] = []
     for c, (camera, step) in enumerate(zip(cameras, calibration, strict=True)):
         if step is None:
             continue
-        center = {"cx": camera.width / 2, "cy": camera.height / 2}
-        sigma = PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)
-        for k, name in enumerate(camera.spec.param_names):
-            value = float(camera.params[k])
-            if name not in step.free:
-                continue
-            if k < camera.spec.num_focal:
-                out.append(CameraPrior(c, k, lower=value / FOCAL_RANGE, upper=value * FOCAL_RANGE))
-            elif name in center:
-                out.append(CameraPrior(c, k, mean=center[name], sigma=sigma))
-            else:
-                largest = max(LARGEST_COEFFICIENT, abs(value))
-                out.append(CameraPrior(c, k, lower=-largest, upper=largest))
+        names = camera.spec.param_names
+        free = [k for k, name in enumerate(names) if name in step.free]
+        out += [_prior_of(c, k, camera, step.prior) for k in free]
+        if {0, 1} <= set(free) and camera.spec.num_focal == 2:
+            sigma = step.prior.aspect_sigma * float(camera.focal[0])
+            out.append(CameraPrior(c, 0, sigma=sigma, of=1, ratio=step.prior.aspect))
     return tuple(out)
+
+
+def _prior_of(c: int, k: int, camera: Camera, known: LensPrior) -> CameraPrior:
+    """The prior of parameter k of camera c."""
+    name, value = camera.spec.param_names[k], float(camera.params[k])
+    if k < camera.spec.num_focal:
+        share = 2.0 * known.aspect / (1.0 + known.aspect) if name == "fx" else 2.0 / (1.0 + known.aspect)
+        mean = known.focal * (1.0 if name == "f" else share)
+        sigma = known.focal_sigma * mean * np.sqrt(camera.spec.num_focal)
+        return CameraPrior(c, k, mean=mean, sigma=sigma, lower=value / FOCAL_RANGE, upper=value * FOCAL_RANGE)
+    if name in CENTER:
+        center = known.center or (camera.width / 2, camera.height / 2)
+        sigma = PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)
+        return CameraPrior(c, k, mean=center[name == "cy"], sigma=sigma)
+    sigma, largest = _distortion_range(camera, name)
+    largest = max(largest, abs(value))
+    return CameraPrior(c, k, sigma=sigma, lower=-largest, upper=largest)
+
+
+def _distortion_range(camera: Camera, name: str) -> tuple[float, float]:
+    """Standard deviation and bound of a distortion coefficient."""
+    fisheye = "FISHEYE" in camera.model
+    power = 2 * int(name[1:]) if fisheye else POWER_OF_RADIUS[name]
+    unit = corner_radius(camera) ** -power
+    if name.startswith("p"):
+        return TANGENTIAL_SIGMA * unit, LARGEST_DISTORTION * unit
+    return RADIAL_SIGMA * unit, LARGEST_DISTORTION * max(unit, 1.0)
+
+
+def what_is_wrong_with(camera: Camera, step: CalibrationStep) -> str:
+    """Why no lens is like this camera: a parameter at a bound, pixels that no single ray reaches, a fisheye lens at
+    ordinary angles; "" if there is nothing."""
+    for k, name in enumerate(camera.spec.param_names):
+        if name in step.free and name in POWER_OF_RADIUS:
+            largest = _distortion_range(camera, name)[1]
+            if abs(camera.params[k]) > (1.0 - NEAR_BOUND) * largest:
+                return f"{name} is at its bound"
+    if not is_invertible(camera):
+        return "its distortion cannot be inverted all over the photo"
+    if "FISHEYE" in camera.model and not sees_like_a_fisheye(camera):
+        return "the angles are not those of a fisheye lens"
+    return ""
+
+
+def with_free_aspect(step: CalibrationStep) -> CalibrationStep:
+    """The same step for pixels of any shape."""
+    return replace(step, prior=replace(step.prior, aspect_sigma=FREE_ASPECT_SIGMA))
+
+
+def with_held_center(step: CalibrationStep) -> CalibrationStep:
+    """The same step with the principal point as it is given."""
+    return replace(step, free=tuple(name for name in step.free if name not in CENTER))
+
+
+def squareness_error(camera: Camera, step: CalibrationStep) -> float:
+    """By what share the ratio of the focal lengths differs from the one given."""
+    fx, fy = camera.focal.tolist()
+    return abs(fx / fy / step.prior.aspect - 1.0)

@@ -48,7 +48,8 @@ class RefinementOptions:
     """The last adjustments; residuals of SIFT keypoints have heavy tails. The scale of the loss follows their noise.
     Reweighting converges slowly: steps that gain less move poses by a thousandth of their error."""
     min_views_for_intrinsics: int = 3
-    """A camera's intrinsics are refined once so many of its photos are in the adjustment."""
+    """Intrinsics are refined in adjustments of so many photos at least: those of a camera once so many of its photos
+    are among them, or all that it has."""
     max_rounds: int = 4
     """Rounds of adjustment and triangulation at the end."""
     threads: int = 1
@@ -167,10 +168,10 @@ def bundle_problem(
     ids, point = np.unique(model.tracks.point[rows], return_inverse=True)
     camera_of_view = model.camera_of_view[registered]
     free_views_of_camera = np.bincount(camera_of_view[free[registered]], minlength=len(model.cameras))
+    needed = np.clip(np.bincount(model.camera_of_view, minlength=len(model.cameras)), 1, min_views_for_intrinsics)
+    enough = (free_views_of_camera >= needed) & (free_views_of_camera.sum() >= min_views_for_intrinsics)
     refine = tuple(
-        step.mask()
-        if step is not None and free_views_of_camera[c] >= min_views_for_intrinsics
-        else np.zeros(len(camera.params), dtype=bool)
+        step.mask() if step is not None and enough[c] else np.zeros(len(camera.params), dtype=bool)
         for c, (camera, step) in enumerate(zip(model.cameras, calibration, strict=True))
     )
     problem = BundleProblem(

@@ -1,4 +1,4 @@
-"""How well a finished model is determined: covariances of its poses and points from the last adjustment."""
+"""How well a finished model is determined: covariances of poses, points and intrinsics from the last adjustment."""
 
 from __future__ import annotations
 
@@ -8,18 +8,29 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.rotation import skew
-from fieldstone.mapping.model.calibration import priors
+from fieldstone.mapping.model.calibration import PRINCIPAL_POINT_SIGMA, CalibrationStep, priors, what_is_wrong_with
 from fieldstone.mapping.model.refinement import Calibration, RefinementOptions, bundle_problem
-from fieldstone.mapping.model.working_model import WorkingModel, reprojections
+from fieldstone.mapping.model.working_model import WorkingModel
+from fieldstone.records.mapping import CameraCertainty
 from fieldstone.scene.mapping_run import Uncertainty
 from fieldstone.solve.bundle.adjustment import BundleOptions
 from fieldstone.solve.bundle.covariance import bundle_covariance
+from fieldstone.solve.bundle.intrinsics_covariance import intrinsics_covariance
+from fieldstone.solve.bundle.problem import BundleProblem, reprojection_residuals
 from fieldstone.solve.robust.loss import RobustLoss, cauchy, huber, soft_l1, trivial
 
 LOSSES: dict[str, Callable[[float], RobustLoss]] = {
     "trivial": lambda _: trivial(), "huber": huber, "soft_l1": soft_l1, "cauchy": cauchy
 }  # fmt: skip
+
+MAX_PHOTOS = 200
+"""Photos that the certainty of intrinsics is computed from."""
+MAX_FOCAL_SD = 0.003
+"""A focal length that is less certain is weakly determined: it moves the corners of a photo by pixels."""
+MAX_CENTER_SHARE = 0.5
+"""A principal point whose standard deviation is a larger share of that of its prior is as good as assumed."""
 
 
 def model_uncertainty(model: WorkingModel, calibration: Calibration, options: RefinementOptions) -> Uncertainty:
@@ -31,10 +42,7 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
     problem, registered, _ = bundle_problem(
         model, model.is_point(), model.registered, calibration, options.min_views_for_intrinsics
     )
-    errors = reprojections(model).scaled_errors
-    freedoms = 2 * len(errors) - 6 * len(registered) - 3 * len(problem.points) + 7
-    freedoms -= int(sum(mask.sum() for mask in problem.refine))
-    sigma = float(np.sqrt(np.sum(errors**2) / max(freedoms, 1)))
+    sigma, errors = _noise(problem)
     bundle = replace(options.final, camera_priors=priors(problem.cameras, calibration))
     found = bundle_covariance(problem, bundle, sigma_px=sigma * robust_factor(errors, bundle))
     of_views = np.full((model.num_views, 6, 6), np.nan)
@@ -42,6 +50,74 @@ def model_uncertainty(model: WorkingModel, calibration: Calibration, options: Re
     rotation = np.rad2deg(np.sqrt(np.trace(of_views[:, :3, :3], axis1=1, axis2=2)))
     sigma_px = sigma * model.typical_pixel_scale()
     return Uncertainty(of_views, found.of_points, sigma_px, rotation, _of_centers(model, of_views))
+
+
+def camera_certainties(
+    model: WorkingModel, calibration: Calibration, options: RefinementOptions
+) -> tuple[CameraCertainty, ...]:
+    """Of every camera: a standard deviation for each intrinsic that was refined, and a word.
+
+    Poses and points are eliminated, and errors may depend on each other within photos and points, see
+    `intrinsics_covariance`. Of large models so many photos say as much as is needed.
+    """
+    part = _part_of(model, MAX_PHOTOS)
+    problem, _, _ = bundle_problem(
+        part, part.is_point(), part.registered, calibration, options.min_views_for_intrinsics
+    )
+    sigma, errors = _noise(problem)
+    bundle = replace(options.final, camera_priors=priors(problem.cameras, calibration))
+    sds = [np.full(len(camera.params), np.nan) for camera in model.cameras]
+    wrong = ""
+    if any(mask.any() for mask in problem.refine):
+        try:
+            loss = LOSSES[bundle.loss](bundle.loss_scale_px)
+            found = intrinsics_covariance(problem, bundle, loss, sigma_px=sigma * robust_factor(errors, bundle))
+        except ValueError as error:
+            wrong = str(error)
+        else:
+            for c, k, sd in zip(found.camera, found.param, found.standard_deviations(), strict=True):
+                sds[c][k] = sd
+    return tuple(
+        _certainty(camera, step, sd, wrong) for camera, step, sd in zip(model.cameras, calibration, sds, strict=True)
+    )
+
+
+def _certainty(camera: Camera, step: CalibrationStep | None, sd: Float[np.ndarray, "p"], wrong: str) -> CameraCertainty:
+    """The word for one camera, and why: its parameters are held, little is known of them, or enough."""
+    known = tuple(None if np.isnan(value) else float(value) for value in sd)
+    if step is None or (np.isnan(sd).all() and not wrong):
+        reason = "given as exact" if step is None else "too few of its photos are in the model to refine it"
+        return CameraCertainty(known, "assumed", reason)
+    focal = float(np.nanmax(sd[: camera.spec.num_focal] / camera.focal[: camera.spec.num_focal], initial=0.0))
+    center = np.nan_to_num(sd[camera.spec.num_focal : camera.spec.num_focal + 2]).max()
+    center_limit = MAX_CENTER_SHARE * PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)
+    if wrong := wrong or what_is_wrong_with(camera, step):
+        return CameraCertainty(known, "weak", wrong)
+    if focal > MAX_FOCAL_SD:
+        return CameraCertainty(known, "weak", f"focal length known to {100 * focal:.2g} % only")
+    if center > center_limit:
+        return CameraCertainty(known, "weak", f"principal point known to {center:.2g} px only")
+    return CameraCertainty(known, "well determined", f"focal length known to {100 * focal:.2g} %")
+
+
+def _part_of(model: WorkingModel, max_photos: int) -> WorkingModel:
+    """The model with so many of its photos at most, spread over their order, and the points that two of them see."""
+    registered = np.flatnonzero(model.registered)
+    if len(registered) <= max_photos:
+        return model
+    keep = np.zeros(model.num_views, dtype=bool)
+    keep[registered[np.linspace(0, len(registered) - 1, max_photos).round().astype(int)]] = True
+    part = model.only_registered(keep)
+    seen = np.bincount(part.tracks.point[part.used_observations()], minlength=len(part.xyz))
+    return replace(part, xyz=np.where((seen >= 2)[:, None], part.xyz, np.nan))
+
+
+def _noise(problem: BundleProblem) -> tuple[float, Float[np.ndarray, "o"]]:
+    """Standard deviation of an observation per axis over the pixel scales, and the errors that tell it."""
+    errors = np.nan_to_num(np.linalg.norm(reprojection_residuals(problem), axis=1), nan=np.inf)
+    freedoms = 2 * len(errors) - 6 * problem.num_views - 3 * len(problem.points) + 7
+    freedoms -= int(sum(mask.sum() for mask in problem.refine))
+    return float(np.sqrt(np.sum(errors**2) / max(freedoms, 1))), errors
 
 
 def robust_factor(errors_px: Float[np.ndarray, "o"], options: BundleOptions) -> float:

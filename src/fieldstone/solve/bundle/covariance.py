@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from fieldstone.geometry.rotation import skew
 from fieldstone.solve.bundle.adjustment import BundleOptions, in_front
-from fieldstone.solve.bundle.buffers import ReducedSystem, SolverBuffers, allocate_linearization, start_values
+from fieldstone.solve.bundle.buffers import ReducedSystem, SolverBuffers, Values, allocate_linearization, start_values
 from fieldstone.solve.bundle.camera_prior import add_priors, prior_rows
 from fieldstone.solve.bundle.layout import BundleLayout, free_view_of_camera, lay_out
 from fieldstone.solve.bundle.problem import BundleProblem
@@ -55,7 +55,28 @@ def bundle_covariance(
     Source:
         `triggs2000`, section 9; `hartley2004`, section 5.2 and appendix 6.3.
     """
-    options = options or BundleOptions()
+    layout, values, buffers, S = reduced_normal_equations(problem, options or BundleOptions())
+    num_fixed_views, num_fixed_points = int(problem.fixed_views.sum()), int(problem.fixed_points.sum())
+    held = num_fixed_views >= 2 or num_fixed_points >= 3 or (num_fixed_views >= 1 and num_fixed_points >= 1)
+    offsets, seen = values.points - layout.pivot, layout.point_start[1:] > layout.point_start[:-1]
+    length = float(np.median(np.linalg.norm(offsets[seen], axis=1)))
+    S_inv = sigma_px**2 * (inverse(S) if held else _inner_inverse(S, layout, length))
+    return BundleCovariance(
+        _views(problem, layout, S_inv),
+        _cameras(problem, layout, S_inv),
+        _points(layout, offsets, buffers, S_inv, sigma_px),
+        "held" if held else "inner",
+    )
+
+
+def reduced_normal_equations(
+    problem: BundleProblem, options: BundleOptions
+) -> tuple[BundleLayout, Values, SolverBuffers, Float[np.ndarray, "n n"]]:
+    """The reduced camera system S with the priors, as a dense matrix, and what the points need to follow.
+
+    Raises:
+        ValueError: It has more than 12,000 columns.
+    """
     layout = lay_out(problem, in_front(problem))
     columns = layout.num_columns + layout.num_shared
     if columns > MAX_COLUMNS:
@@ -66,18 +87,7 @@ def bundle_covariance(
     system = camera_system(solver, values, at)
     add_priors(prior_rows(problem, layout, options.camera_priors), values.params, system)
     S = _dense(layout, solver.pattern.given_index, reduce_system(solver, values, at, system, 0.0))
-
-    num_fixed_views, num_fixed_points = int(problem.fixed_views.sum()), int(problem.fixed_points.sum())
-    held = num_fixed_views >= 2 or num_fixed_points >= 3 or (num_fixed_views >= 1 and num_fixed_points >= 1)
-    offsets, seen = values.points - layout.pivot, layout.point_start[1:] > layout.point_start[:-1]
-    length = float(np.median(np.linalg.norm(offsets[seen], axis=1)))
-    S_inv = sigma_px**2 * (_inverse(S) if held else _inner_inverse(S, layout, length))
-    return BundleCovariance(
-        _views(problem, layout, S_inv),
-        _cameras(problem, layout, S_inv),
-        _points(layout, offsets, solver.buffers, S_inv, sigma_px),
-        "held" if held else "inner",
-    )
+    return layout, values, solver.buffers, S
 
 
 def _dense(
@@ -98,7 +108,7 @@ def _dense(
     return np.tril(S) + np.tril(S, -1).T
 
 
-def _inverse(S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def inverse(S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Inverse of a positive definite matrix, scaled to a unit diagonal first."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     scaled = S * scale[:, None] * scale
@@ -120,7 +130,7 @@ def _inner_inverse(S: Float[np.ndarray, "n n"], layout: BundleLayout, length: fl
         pose[i * layout.block : i * layout.block + 6] = True
         unit[i * layout.block + 3 : i * layout.block + 6] = length
     A, C, D = S[np.ix_(pose, pose)], S[np.ix_(~pose, pose)], S[np.ix_(~pose, ~pose)]
-    D_inv = _inverse(D) if len(D) else D
+    D_inv = inverse(D) if len(D) else D
     scale = unit[pose]
     reduced = (A - C.T @ D_inv @ C) * scale[:, None] * scale
     eigenvalues, vectors = np.linalg.eigh(reduced)
