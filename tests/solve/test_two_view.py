@@ -1,5 +1,7 @@
 """Relative pose among outliers: truth, noise, determinism, degenerate input, and the kernels' derivatives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
@@ -196,6 +198,18 @@ def test_pure_rotation_is_panoramic(seed):
     assert angle_between(found.cam2_from_cam1.R, R) < np.deg2rad(0.05)
     K = CAMERA1.calibration_matrix()
     np.testing.assert_allclose(found.matrix, K @ found.cam2_from_cam1.R @ np.linalg.inv(K))
+
+
+def test_copies_of_a_photo_show_no_motion_whatever_is_said_of_their_cameras():
+    """With two focal lengths they would be a plane, seen from two distances."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform([0, 0], [CAMERA1.width, CAMERA1.height], size=(300, 2))
+    longer = replace(CAMERA1, params=CAMERA1.params * np.where(np.arange(len(CAMERA1.params)) < 2, 1.5, 1.0))
+    found = estimate_two_view(CAMERA1, longer, pixels, pixels + 0.2 * rng.normal(size=(300, 2)), OPTIONS, rng)
+    assert found.kind == "panoramic"
+    assert found.cam2_from_cam1 is not None
+    assert not found.cam2_from_cam1.t.any()
+    assert found.inliers.all()
 
 
 @pytest.mark.parametrize("seed", range(5))

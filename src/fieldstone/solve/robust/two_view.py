@@ -65,7 +65,8 @@ def estimate_two_view(
     Errors are Sampson errors in pixels: ideal coordinates, with the size of a pixel on the ideal plane at each match.
     The last refinement uses the loss of Geman and McClure, at a scale that follows the inliers' own noise. Where E is
     estimated, inliers also lie in front of both cameras. Matrices of kind "uncalibrated", "planar" and "panoramic"
-    are for pixels of the ideal (undistorted) photos.
+    are for pixels of the ideal (undistorted) photos. Matches that stay where they are come from copies of one photo,
+    which tell nothing, whatever is said of their cameras: they are panoramic, without a turn.
 
     Args:
         quality: Higher is better; good matches are then sampled first (PROSAC).
@@ -86,6 +87,9 @@ def estimate_two_view(
         return degenerate(len(pixels1))
     ranked = None if quality is None else np.argsort(-quality[matches.rows], kind="stable")
     K1, K2 = camera1.calibration_matrix(), camera2.calibration_matrix()
+    unmoved = np.linalg.norm(pixels2 - pixels1, axis=1) < options.ransac.max_error_px * max(pixel_scales)
+    if options.focal_known and np.mean(unmoved) >= options.panoramic_ratio:
+        return TwoView("panoramic", np.eye(3), Rigid3.identity(), unmoved)
     if options.focal_known:
         return _calibrated(matches, ranked, K1, K2, options, rng)
     return _uncalibrated(matches, ranked, K1, K2, options, rng)
