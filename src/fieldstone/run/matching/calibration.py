@@ -201,15 +201,17 @@ def _with_cameras_apart(
 
     Where it leaves what EXIF states of some photos, matches have to fit significantly better.
     """
-    # EXIF that nobody doubts of all photos of a camera may still be wrong for some of them.
+    # EXIF that nobody doubts for all photos of a camera may still be wrong for some of them.
     believed = ~np.isnan(stated.stated) & ~doubted
-    soft = replace(grouping.prior, stated=np.where(believed, stated.stated, np.nan))
-    soft = replace(
-        soft, mean=np.where(believed, stated.mean, soft.mean), sigma=np.where(believed, stated.sigma, soft.sigma)
-    )
-    evidence = case.pairs.parallax
-    start = Grouping.of(evidence, grouping.group, soft, grouping.estimate.log_focal)
-    for finer in reversed(list(finer_groupings(evidence, start, folder))):
+    start = grouping
+    if believed.any():
+        prior = FocalPrior(
+            np.where(believed, stated.mean, grouping.prior.mean),
+            np.where(believed, stated.sigma, grouping.prior.sigma),
+            np.where(believed, stated.stated, np.nan),
+        )
+        start = Grouping.of(case.pairs.parallax, grouping.group, prior, grouping.estimate.log_focal)
+    for finer in reversed(list(finer_groupings(case.pairs.parallax, start, folder))):
         leaves_exif = ~np.isnan(finer.prior.stated) & (finer.prior.belief(finer.estimate.log_focal) < 0.5)
         needed = case.needed(finer, leaves_exif[finer.group]) if leaves_exif.any() else TOLERATED
         if case.significance(grouping, finer, np.ones(len(folder), dtype=bool)) > needed:
@@ -274,7 +276,8 @@ def _of_unknown(ratios, vague: Bool[np.ndarray, "n"], group: Int[np.ndarray, "n"
     """One line, if the focal lengths of some photos remain a guess."""
     if not vague.any():
         return []
-    which = "focal length" if vague.all() else f"focal lengths of {vague.sum()} photos"
+    count = int(vague.sum())
+    which = "focal length" if vague.all() else f"focal length of {count} photo{'s' if count > 1 else ''}"
     about = np.median(ratios[group[vague]])
     return [f"{which} unknown, and the photos do not tell: about {about:.2f} times the longer side, guessed"]
 

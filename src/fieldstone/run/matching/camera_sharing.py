@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from fieldstone.solve.averaging.focal_lengths import (
     FocalEstimate,
@@ -22,6 +22,8 @@ COST_OF_CAMERA = 2.0
 """Logarithm of the odds against one more camera: photos of one size and one EXIF body start as those of one."""
 COST_OF_SPLIT = 3.0
 """And against there being more than one at all."""
+MAX_PARTS = 4
+"""Into how many parts a group is split at once, if not into its photos; parts are split again."""
 REASSIGNMENTS = 5
 
 
@@ -57,8 +59,8 @@ class Grouping:
 def finer_groupings(evidence: PairEvidence, grouping: Grouping, hint: Int[np.ndarray, "n"]) -> Iterator[Grouping]:
     """More and more probable groupings, each of which splits a group of the one before.
 
-    A group is split in two, by the hint, or into its photos, whichever raises the evidence of all pairs most, if that
-    is by more than the further cameras cost; halves are split again.
+    A group is split in a few parts, by the hint, or into its photos, whichever raises the evidence of all pairs most,
+    if that is by more than the further cameras cost; parts are split again.
 
     Args:
         hint: Of every photo, a number that photos of one camera may have in common, such as that of its folder.
@@ -72,8 +74,7 @@ def finer_groupings(evidence: PairEvidence, grouping: Grouping, hint: Int[np.nda
             continue
         finer = _best_split(evidence, grouping, g, hint)
         if finer is not None:
-            if finer.num_groups == grouping.num_groups + 1:
-                waiting += [g, grouping.num_groups]
+            waiting += [g, *range(grouping.num_groups, finer.num_groups)]
             grouping = finer
             yield grouping
 
@@ -81,24 +82,26 @@ def finer_groupings(evidence: PairEvidence, grouping: Grouping, hint: Int[np.nda
 def _best_split(evidence: PairEvidence, grouping: Grouping, g: int, hint: Int[np.ndarray, "n"]) -> Grouping | None:
     """The most probable split of group g; None if g as it is is more probable."""
     members = np.flatnonzero(grouping.group == g)
-    apart = _split(
-        evidence, grouping, g, np.arange(len(members)), np.full(len(members), grouping.estimate.log_focal[g])
-    )
-    candidates = [apart]
-    if len(members) > 2:
-        candidates.append(_in_two(evidence, grouping, g, apart))
-    if np.ptp(hint[members]):
-        candidates.append(_split(evidence, grouping, g, hint[members], apart.log_focal[members]))
 
     def gain(finer: Grouping) -> float:
         more = finer.num_groups - grouping.num_groups
         return finer.estimate.log_evidence - grouping.estimate.log_evidence - COST_OF_SPLIT - COST_OF_CAMERA * more
 
+    apart = _split(
+        evidence, grouping, g, np.arange(len(members)), np.full(len(members), grouping.estimate.log_focal[g])
+    )
+    candidates = [apart]
+    if np.ptp(hint[members]):
+        candidates.append(_split(evidence, grouping, g, hint[members], apart.log_focal[members]))
+    for parts in range(2, min(MAX_PARTS, len(members) - 1) + 1):
+        candidates.append(_in_parts(evidence, grouping, g, apart, parts))
+        if max(map(gain, candidates)) <= 0:
+            return None
     best = max(candidates, key=gain)
     return best if gain(best) > 0 and np.ptp(best.log_focal[members]) > SMALLEST_DIFFERENCE else None
 
 
-def _in_two(evidence: PairEvidence, grouping: Grouping, g: int, apart: Grouping) -> Grouping:
+def _in_parts(evidence: PairEvidence, grouping: Grouping, g: int, apart: Grouping, parts: int) -> Grouping:
     """Group g cut where the focal lengths of its photos differ most, then every photo where it fits best.
 
     Args:
@@ -106,18 +109,16 @@ def _in_two(evidence: PairEvidence, grouping: Grouping, g: int, apart: Grouping)
     """
     members = np.flatnonzero(grouping.group == g)
     y = apart.log_focal[members]
-    upper = _above_cut(y, apart.estimate.sigma[apart.group[members]] ** -2.0)
-    best = _split(evidence, grouping, g, upper.astype(np.int64), y)
+    part = _cut(y, apart.estimate.sigma[apart.group[members]] ** -2.0, parts)
+    best = _split(evidence, grouping, g, part, y)
     for _ in range(REASSIGNMENTS):
-        fits = [
-            log_likelihood_of_photos(evidence, best.log_focal, members, float(best.estimate.log_focal[k]))
-            for k in (g, grouping.num_groups)
-        ]
-        moved = np.where(fits[1] == fits[0], upper, fits[1] > fits[0])
-        if moved.all() or not moved.any() or (moved == upper).all():
+        values = [float(best.estimate.log_focal[k]) for k in (g, *range(grouping.num_groups, best.num_groups))]
+        fits = np.array([log_likelihood_of_photos(evidence, best.log_focal, members, value) for value in values])
+        moved = np.where(fits.max(axis=0) > fits[part, np.arange(len(members))], fits.argmax(axis=0), part)
+        if len(np.unique(moved)) < parts or (moved == part).all():
             break
-        upper = moved
-        other = _split(evidence, grouping, g, upper.astype(np.int64), best.log_focal[members])
+        part = moved
+        other = _split(evidence, grouping, g, part, best.log_focal[members])
         if other.estimate.log_evidence <= best.estimate.log_evidence:
             break
         best = other
@@ -146,14 +147,22 @@ def _split(
     return Grouping.of(evidence, group, grouping.prior.of(origin), start)
 
 
-def _above_cut(values, weights) -> Bool[np.ndarray, "m"]:
-    """Which values are above the cut that leaves the least weighted variance on both sides."""
+def _cut(values: Float[np.ndarray, "m"], weights: Float[np.ndarray, "m"], parts: int) -> Int[np.ndarray, "m"]:
+    """Numbers of parts of a line, each cut off where that lowers the weighted variance within parts most."""
     order = np.argsort(values, kind="stable")
     y, w = values[order], weights[order]
-    below_w, below_y = np.cumsum(w)[:-1], np.cumsum(w * y)[:-1]
-    above_w, above_y = w.sum() - below_w, np.sum(w * y) - below_y
-    # The variance within is the total less that between the two means.
-    between = below_y**2 / below_w + above_y**2 / above_w
-    out = np.ones(len(values), dtype=bool)
-    out[order[: int(np.argmax(between)) + 1]] = False
+    part = np.zeros(len(y), dtype=np.int64)
+    for number in range(1, parts):
+        gains = np.zeros(len(y))
+        for k in range(number):
+            inside = np.flatnonzero(part == k)
+            left_w, left_y = np.cumsum(w[inside])[:-1], np.cumsum((w * y)[inside])[:-1]
+            right_w, right_y = w[inside].sum() - left_w, (w * y)[inside].sum() - left_y
+            # The variance within falls by that between the two means.
+            between = left_w * right_w / (left_w + right_w) * (left_y / left_w - right_y / right_w) ** 2
+            gains[inside[1:]] = between
+        start = int(np.argmax(gains))
+        part[(part == part[start]) & (np.arange(len(y)) >= start)] = number
+    out = np.empty(len(values), dtype=np.int64)
+    out[order] = part
     return out

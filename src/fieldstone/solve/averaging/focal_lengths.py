@@ -234,7 +234,8 @@ def _starts(evidence: PairEvidence, group, prior: FocalPrior, start) -> list[Flo
     fit = _log_likelihood(squared_distances(evidence, y[i], y[j])).sum(axis=0)
     peaks = [k for k in range(len(GRID)) if fit[k] >= fit[max(k - 1, 0)] and fit[k] >= fit[min(k + 1, len(GRID) - 1)]]
     best = sorted(peaks, key=lambda k: (-fit[k], k))[:MAX_STARTS]
-    return [start, *(y[:, k] for k in best)]
+    # A peak beside the start is the same hill.
+    return [start, *(y[:, k] for k in best if abs(offsets[k]) > GRID[1] - GRID[0])]
 
 
 def _climb(evidence: PairEvidence, group, prior: FocalPrior, y: Float[np.ndarray, "g"]) -> FocalEstimate:

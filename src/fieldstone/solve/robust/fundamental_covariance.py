@@ -49,7 +49,7 @@ def fundamental_covariance(
     )
     slope = np.maximum(slope, 1e-12 * max(scales))
     errors = np.sum(h2 * line2, axis=1) / slope
-    tangent = _directions(F)
+    tangent = directions(F)
     J = np.einsum("ni,kij,nj->nk", h2, tangent, h1) / slope[:, None]
     # Directions that the matches do not feel at all get a large variance, not an infinite one.
     values, vectors = np.linalg.eigh(J.T @ J)
@@ -69,7 +69,7 @@ def fundamental_covariance(
     return basis.T @ (noise**2 * inverse + moved @ moved.T) @ basis
 
 
-def _directions(F: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "7 3 3"]:
+def directions(F: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "7 3 3"]:
     """Orthonormal directions in which F keeps rank 2 and norm 1."""
     (u1, u2, u3), s, (v1, v2, v3) = (m.T if k == 0 else m for k, m in enumerate(np.linalg.svd(F)))
     along = (s[1] * np.outer(u1, v1) - s[0] * np.outer(u2, v2)) / np.hypot(s[0], s[1])
