@@ -237,7 +237,7 @@ def _told(case: _Case, grouping: Grouping) -> tuple[PhotoCameras, list[str]]:
     notes = [
         *_of_false_exif(case, grouping, header, np.flatnonzero(false_exif)),
         *_of_unknown(ratios, vague[grouping.group], grouping.group),
-        *(_of_cameras_apart(ratios[origin == c], np.sum(known.camera_of_image == c)) for c in _repeated(origin)),
+        *(_of_cameras_apart(ratios[origin == c], int(np.sum(known.camera_of_image == c))) for c in _repeated(origin)),
     ]
     for note in notes:
         logger.warning("%s", note)
