@@ -183,6 +183,19 @@ def test_given_cameras_and_those_of_few_photos_are_assumed(facade):
     assert "too few of its photos" in certainty.reason
 
 
+def test_a_camera_of_one_photo_is_weak_whatever_its_standard_deviations():
+    """The photo's errors sum to nothing where its own camera has been fitted to them."""
+    _, sub_model = registered(PLAIN, layout="ring")
+    model = sub_model.model
+    of_view = np.where(np.arange(model.num_views) == 3, 1, 0)
+    two = replace(model, cameras=(*model.cameras, *model.cameras), camera_of_view=of_view)
+    steps = (*sub_model.calibration, *sub_model.calibration)
+    shared, alone = camera_certainties(two, steps, RefinementOptions())
+    assert shared.word == "well determined"
+    assert (alone.word, alone.reason) == ("weak", "refined from 1 photos only")
+    assert alone.sds[0] is not None
+
+
 def test_a_model_that_all_tracks_make_no_lens_is_given_up(facade, monkeypatch):
     _, sub_model = facade
     rich = replace(CANDIDATE_STEPS[3], prior=LensPrior.of(PLAIN))

@@ -25,6 +25,8 @@ LOSSES: dict[str, Callable[[float], RobustLoss]] = {
     "trivial": lambda _: trivial(), "huber": huber, "soft_l1": soft_l1, "cauchy": cauchy
 }  # fmt: skip
 
+MIN_PHOTOS = 3
+"""What fewer photos have in common is their camera's, for all that they tell."""
 MAX_PHOTOS = 200
 """Photos that the certainty of intrinsics is computed from."""
 MAX_FOCAL_SD = 0.003
@@ -77,17 +79,26 @@ def camera_certainties(
         else:
             for c, k, sd in zip(found.camera, found.param, found.standard_deviations(), strict=True):
                 sds[c][k] = sd
+    photos = np.bincount(model.camera_of_view[model.registered], minlength=len(model.cameras))
+    few = [f"refined from {n} photos only" if 0 < n < MIN_PHOTOS else "" for n in photos.tolist()]
+    nothing = CameraCertainty((), "assumed", "too few of its photos are in the model to refine it")
     return tuple(
-        _certainty(camera, step, sd, wrong) for camera, step, sd in zip(model.cameras, calibration, sds, strict=True)
+        _certainty(camera, step, sd, wrong or fewer)
+        if step is None or mask.any()
+        else replace(nothing, sds=(None,) * len(sd))
+        for camera, step, sd, fewer, mask in zip(model.cameras, calibration, sds, few, problem.refine, strict=True)
     )
 
 
 def _certainty(camera: Camera, step: CalibrationStep | None, sd: Float[np.ndarray, "p"], wrong: str) -> CameraCertainty:
-    """The word for one camera, and why: its parameters are held, little is known of them, or enough."""
+    """The word for one camera, and why: its parameters are held, little is known of them, or enough.
+
+    Args:
+        wrong: Why they are not to be relied on, whatever their standard deviations; "" if there is nothing.
+    """
     known = tuple(None if np.isnan(value) else float(value) for value in sd)
-    if step is None or (np.isnan(sd).all() and not wrong):
-        reason = "given as exact" if step is None else "too few of its photos are in the model to refine it"
-        return CameraCertainty(known, "assumed", reason)
+    if step is None:
+        return CameraCertainty(known, "assumed", "given as exact")
     focal = float(np.nanmax(sd[: camera.spec.num_focal] / camera.focal[: camera.spec.num_focal], initial=0.0))
     center = np.nan_to_num(sd[camera.spec.num_focal : camera.spec.num_focal + 2]).max()
     center_limit = MAX_CENTER_SHARE * PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)
@@ -112,9 +123,10 @@ def _part_of(model: WorkingModel, max_photos: int) -> WorkingModel:
     return replace(part, xyz=np.where((seen >= 2)[:, None], part.xyz, np.nan))
 
 
-def _noise(problem: BundleProblem) -> tuple[float, Float[np.ndarray, "o"]]:
+def _noise(problem: BundleProblem) -> tuple[float, Float[np.ndarray, "k"]]:
     """Standard deviation of an observation per axis over the pixel scales, and the errors that tell it."""
-    errors = np.nan_to_num(np.linalg.norm(reprojection_residuals(problem), axis=1), nan=np.inf)
+    errors = np.linalg.norm(reprojection_residuals(problem), axis=1)
+    errors = errors[np.isfinite(errors)]
     freedoms = 2 * len(errors) - 6 * problem.num_views - 3 * len(problem.points) + 7
     freedoms -= int(sum(mask.sum() for mask in problem.refine))
     return float(np.sqrt(np.sum(errors**2) / max(freedoms, 1))), errors
