@@ -181,8 +181,10 @@ def cameras_of(model: Reconstruction) -> str:
 
 def grade_lines(grade: Grade) -> list[str]:
     """The numbers of a grade, and its reasons."""
-    shares = (grade.matches_kept, grade.error_added, grade.matches_turned)
-    numbers = "kept {}, error added {}, turned {}".format(*("-" if s is None else f"{s:.3f}" for s in shares))
+    shares = (grade.matches_kept, grade.matches_denied, grade.error_added, grade.matches_turned)
+    numbers = "kept {}, denied {}, error added {}, turned {}".format(
+        *("-" if s is None else f"{s:.3f}" for s in shares)
+    )
     return [f"grade {grade.word}: {numbers}", *(f"grade {r.word}: {r.reason}" for r in grade.reasons)]
 
 

@@ -13,11 +13,12 @@ from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.grading.focal_evidence import focal_evidence
-from fieldstone.mapping.grading.grade import grade_model, pairs_to_ask
+from fieldstone.mapping.grading.grade import grade_run, pairs_to_ask
 from fieldstone.mapping.grading.hold import hinges, weakly_held
 from fieldstone.mapping.grading.options import GradingOptions, Limits
 from fieldstone.mapping.grading.pair_evidence import evidence_of_pairs, jacobian, moved, sampson_px
-from fieldstone.records.mapping import Grade
+from fieldstone.records.mapping import CameraCertainty, Grade
+from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.match_graph import MatchGraph
 from fieldstone.scene.reconstruction import Points, Reconstruction, View
 from fieldstone.scene.tracks import Observations
@@ -42,7 +43,11 @@ def ordinary_building() -> tuple[Reconstruction, MatchGraph]:
 
 
 def grade(model: Reconstruction, graph: MatchGraph, known=FREE, options=OPTIONS) -> Grade:
-    return grade_model(model, graph, graph, np.repeat(known, len(model.cameras)), options, 0, 2)
+    return grade_run(run_of(model, graph), graph, np.repeat(known, len(model.cameras)), options, 0, 2)
+
+
+def run_of(model: Reconstruction, graph: MatchGraph) -> MappingRun:
+    return MappingRun(model, graph, None, (), (), None, {})
 
 
 def with_poses(model: Reconstruction, poses: dict[int, Rigid3]) -> Reconstruction:
@@ -74,7 +79,7 @@ def test_a_right_model_is_good():
 
 def test_the_grade_is_the_same_for_any_number_of_threads():
     model, graph = ordinary_building()
-    one, two = (grade_model(model, graph, graph, FREE, OPTIONS, 3, threads) for threads in (1, 2))
+    one, two = (grade_run(run_of(model, graph), graph, FREE, OPTIONS, 3, threads) for threads in (1, 2))
     assert one == two
 
 
@@ -93,7 +98,7 @@ def test_a_photo_of_another_lens_is_named():
     assert found.word != "good"
     given = np.repeat(False, 2)
     given[1] = True
-    exact = grade_model(with_focal(model, {5: 1.4}), graph, graph, given, OPTIONS, 0, 2)
+    exact = grade_run(run_of(with_focal(model, {5: 1.4}), graph), graph, given, OPTIONS, 0, 2)
     assert exact.other_focal == ()  # nobody asks what was given
 
 
@@ -140,7 +145,7 @@ def test_pairs_that_were_left_out_make_a_model_weak():
     pairs = [pair for pair, two_view in graph.two_views.items() if two_view.inliers.any()]
     gone = {pair: degenerate(len(graph.matches[pair])) for pair in pairs[::4]}
     left = graph.with_two_views({**graph.two_views, **gone})
-    found = grade_model(model, left, graph, FREE, OPTIONS, 0, 2)
+    found = grade_run(run_of(model, left), graph, FREE, OPTIONS, 0, 2)
     assert [reason.word for reason in found.reasons] == ["weak"]
     assert f"{len(gone)} of {len(pairs)} pairs" in found.reasons[0].reason
 
@@ -153,6 +158,19 @@ def test_pixels_are_square_unless_they_are_given(ratio, word):
     words = [reason.word for reason in grade(wrong, graph).reasons if "square" in reason.reason]
     assert words == ([] if word == "good" else [word])
     assert not any("square" in reason.reason for reason in grade(wrong, graph, np.array([True])).reasons)
+
+
+def test_cameras_that_are_assumed_make_a_model_weak():
+    model, graph = ordinary_building()
+    run = replace(run_of(model, graph), certainties=(CameraCertainty((None,), "assumed", "nobody knows"),))
+    found = grade_run(run, graph, FREE, OPTIONS, 0, 2)
+    assert [(reason.word, "nobody knows" in reason.reason) for reason in found.reasons] == [("weak", True)]
+    assert grade_run(run, graph, np.array([True]), OPTIONS, 0, 2).word == "good"
+
+
+def test_an_alternative_makes_a_model_weak():
+    model, graph = ordinary_building()
+    assert grade_run(replace(run_of(model, graph), alternative=(model,)), graph, FREE, OPTIONS, 0, 2).word == "weak"
 
 
 def test_no_model_is_doubtful():

@@ -149,6 +149,8 @@ class Grade:
     """Share of their matches that the model explains."""
     error_added: float | None = None
     """Share of the variance of the matches' epipolar errors that their own geometry does not have; of the median."""
+    matches_denied: float | None = None
+    """Share of matches in pairs of which the model explains less than half."""
     matches_turned: float | None = None
     """Share of matches in pairs that would turn their cameras against each other, significantly."""
     other_focal: tuple[str, ...] = ()

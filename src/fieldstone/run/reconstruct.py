@@ -15,7 +15,7 @@ from fieldstone import __version__
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import is_given_matches_folder
 from fieldstone.io.posed.model_photos import photos_of_model
-from fieldstone.mapping.grading.grade import grade_model
+from fieldstone.mapping.grading.grade import grade_run
 from fieldstone.progress import OnProgress, Progress, silent
 from fieldstone.records.mapping import CameraRecord, DropRecord, Grade, PhotoVerdict, RunRecord
 from fieldstone.report.figures import PhotoByName, shrunk, thumbnails
@@ -156,10 +156,7 @@ def run_mapper(
 def graded(run: MappingRun, photos: MatchedPhotos, options: ReconstructOptions) -> Grade:
     """How far the first model can be believed, asked of the matches again."""
     known = photos.known[: len(run.reconstruction.cameras)]
-    tuning, threads = options.tuning.grading, options.matching().threads
-    return grade_model(
-        run.reconstruction, run.graph, photos.graph, known, tuning, options.seed, threads, run.alternative
-    )
+    return grade_run(run, photos.graph, known, options.tuning.grading, options.seed, options.matching().threads)
 
 
 def run_record(

@@ -18,6 +18,7 @@ from fieldstone.mapping.grading.hold import hinges, weakly_held
 from fieldstone.mapping.grading.options import GradingOptions, Limits
 from fieldstone.mapping.grading.pair_evidence import PairEvidence, evidence_of_pairs
 from fieldstone.records.mapping import Grade, GradeReason
+from fieldstone.scene.mapping_run import MappingRun
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
 from fieldstone.scene.reconstruction import Reconstruction
 
@@ -27,33 +28,27 @@ HALF = 0.5
 """A photo of which pairs contradict more than half of the matches is in the wrong place."""
 
 
-def grade_model(
-    model: Reconstruction,
-    graph: MatchGraph,
+def grade_run(
+    run: MappingRun,
     verified: MatchGraph,
     known: Bool[np.ndarray, "c"],
     options: GradingOptions,
     seed: int,
     threads: int,
-    alternative: Sequence[Reconstruction] = (),
 ) -> Grade:
-    """The grade of a model.
+    """The grade of the first model of a run.
 
     Args:
-        graph: The matches that it was made of.
         verified: The matches as they were before any pair was taken to be false.
         known: Cameras whose intrinsics were given as exact.
-        alternative: Models that explain the photos as well.
     """
+    model, graph = run.reconstruction, run.graph
     registered = model.registered()
     if len(registered) < 2:
         return _grade([GradeReason("doubtful", "no two photos are in one model", "take more photos that overlap")])
     pairs = pairs_to_ask(model, graph, options.max_pairs, np.random.default_rng([seed, len(registered)]))
     asked = evidence_of_pairs(model, graph, pairs, options.two_view, seed, threads)
-    reasons = [*_of_size(model), *_of_left_out(graph, verified, options), *_of_cameras(model, known, options)]
-    if alternative:
-        reason = "places look alike, and the photos do not tell which of two models is true: both are kept"
-        reasons.append(GradeReason("weak", reason, "compare both with the place, or add photos of what is around"))
+    reasons = [*_of_size(model), *_of_false_pairs(run, verified, options), *_of_cameras(run, known, options)]
     if not asked:
         reasons.append(GradeReason("weak", "no pair of its photos has enough matches to be asked", "take more photos"))
         return _grade(reasons)
@@ -66,6 +61,7 @@ def grade_model(
         "pairs": len(asked),
         "matches_kept": 1.0 - table.lost,
         "error_added": table.error_added,
+        "matches_denied": table.denied,
         "matches_turned": table.turned,
         "other_focal": _names(model, np.flatnonzero(wanted)),
         "contradicted": _names(model, contradicted),
@@ -120,6 +116,11 @@ class _Table:
         return 1.0 - float(np.average(self.kept, weights=self.matches))
 
     @property
+    def denied(self) -> float:
+        """Share of matches in pairs that the model shows at different places."""
+        return float(np.average(self.kept < HALF, weights=self.matches))
+
+    @property
     def turned(self) -> float:
         """Share of matches in pairs that want another rotation."""
         return float(np.average(self.turns, weights=self.matches))
@@ -153,21 +154,38 @@ def _of_size(model: Reconstruction) -> Iterator[GradeReason]:
         )
 
 
-def _of_left_out(graph: MatchGraph, verified: MatchGraph, options: GradingOptions) -> Iterator[GradeReason]:
-    """Pairs that agree on a geometry and were taken to be false."""
+def _of_false_pairs(run: MappingRun, verified: MatchGraph, options: GradingOptions) -> Iterator[GradeReason]:
+    """Pairs that agree on a geometry and were taken to be false, and models that explain the photos as well."""
     pairs = [pair for pair in verified.two_views if _is_verified(verified, pair)]
-    gone = [pair for pair in pairs if not _is_verified(graph, pair)]
+    gone = [pair for pair in pairs if not _is_verified(run.graph, pair)]
     if word := _word(len(gone) / max(len(pairs), 1), options.left_out):
         yield GradeReason(
             word,
             f"{len(gone)} of {len(pairs)} pairs were taken to be false, because places look alike",
             "compare the model with the place; photos between those that look alike settle it",
         )
+    if run.alternative:
+        yield GradeReason(
+            "weak",
+            "places look alike, and the photos do not tell which of two models is true: both are kept",
+            "compare both with the place, or add photos of what is around",
+        )
 
 
-def _of_cameras(model: Reconstruction, known: Bool[np.ndarray, "c"], options: GradingOptions) -> Iterator[GradeReason]:
-    """Cameras as nobody builds them."""
-    for c in sorted({model.views[v].camera for v in model.registered().tolist()}):
+def _of_cameras(run: MappingRun, known: Bool[np.ndarray, "c"], options: GradingOptions) -> Iterator[GradeReason]:
+    """Cameras that the photos hardly determine, and cameras as nobody builds them."""
+    model = run.reconstruction
+    photos = [model.views[v].camera for v in model.registered().tolist()]
+    vague = [c for c in photos if c < len(run.certainties) and run.certainties[c].word != "well determined"]
+    vague = [c for c in vague if not known[c]]
+    if word := _word(len(vague) / len(photos), options.uncertain_cameras):
+        yield GradeReason(
+            word,
+            f"the cameras of {len(vague)} of {len(photos)} photos are not well determined: "
+            f"{run.certainties[vague[0]].reason}",
+            "give the intrinsics, or take more photos with each camera, also turned by a right angle",
+        )
+    for c in sorted(set(photos)):
         fx, fy = model.cameras[c].focal
         if (word := _word(abs(fx / fy - 1.0), options.max_pixel_ratio)) and not known[c]:
             yield GradeReason(
@@ -184,6 +202,9 @@ def _of_matches(table: _Table, options: GradingOptions) -> Iterator[GradeReason]
         yield GradeReason(word, f"{table.error_added:.0%} of the matches' error is the model's, not theirs", advice)
     if word := _word(table.lost, options.lost):
         yield GradeReason(word, f"{table.lost:.0%} of the matches do not fit the model", advice)
+    if word := _word(table.denied, options.denied):
+        reason = f"{table.denied:.0%} of the matches join photos that the model shows at different places"
+        yield GradeReason(word, reason, "look for places that look alike, and for parts of the model upon each other")
     if word := _word(table.turned, options.turned):
         reason = f"{table.turned:.0%} of the matches want their photos turned by over {options.min_turn_deg:g} degrees"
         yield GradeReason(word, reason, advice)

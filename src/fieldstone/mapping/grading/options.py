@@ -27,16 +27,21 @@ class GradingOptions:
     """Of more, a sample is asked."""
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     """How the geometry of a pair is found again."""
-    error_added: Limits = field(default_factory=lambda: Limits(1 / 3, 2 / 3))
+    error_added: Limits = field(default_factory=lambda: Limits(1 / 3, 4 / 5))
     """Share of the errors' variance that is the model's doing, at the median match."""
-    lost: Limits = field(default_factory=lambda: Limits(0.05, 0.15))
+    lost: Limits = field(default_factory=lambda: Limits(0.1, 0.15))
     """Share of matches that the model does not explain."""
-    turned: Limits = field(default_factory=lambda: Limits(0.05, 0.1))
+    denied: Limits = field(default_factory=lambda: Limits(0.03, 0.1))
+    """Share of matches in pairs of which the model explains less than half: it shows such pairs at different places. A
+    building that is folded upon itself denies no more than the pairs along the folds."""
+    turned: Limits = field(default_factory=lambda: Limits(0.05, 0.5))
     """Share of matches in pairs that want another relative rotation."""
-    contradicted: Limits = field(default_factory=lambda: Limits(0.0, 0.2))
+    contradicted: Limits = field(default_factory=lambda: Limits(0.0, 0.5))
     """Share of photos whose pairs contradict their place."""
-    other_focal: Limits = field(default_factory=lambda: Limits(0.0, 0.2))
+    other_focal: Limits = field(default_factory=lambda: Limits(0.0, 0.5))
     """Share of photos whose pairs want another focal length."""
+    uncertain_cameras: Limits = field(default_factory=lambda: Limits(1 / 3, 1.0))
+    """Share of photos whose camera the photos do not determine well."""
     left_out: Limits = field(default_factory=lambda: Limits(0.1, 1.0))
     """Share of pairs that mapping took to be false."""
     min_turn_deg: float = 3.0
