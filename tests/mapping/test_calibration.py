@@ -6,7 +6,16 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.camera import Camera, image_from_cam, plane_from_image
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
-from fieldstone.mapping.model.calibration import CANDIDATE_STEPS, as_model, first_step, priors, richer_steps
+from fieldstone.mapping.model.calibration import (
+    ASPECT_SIGMA,
+    CANDIDATE_STEPS,
+    PRINCIPAL_POINT_SIGMA,
+    as_model,
+    first_step,
+    priors,
+    richer_steps,
+    what_is_wrong_with,
+)
 from fieldstone.scene.alignment import align
 from fieldstone.solve.robust.two_view import TwoViewOptions
 from fieldstone.synthetic.scenes import SceneOptions, synthesize
@@ -71,6 +80,49 @@ def test_every_step_above_refines_more():
             CANDIDATE_STEPS.index(other) for other in above
         )
     assert richer_steps(CANDIDATE_STEPS[-1]) == []
+
+
+STEP = {step.model: step for step in CANDIDATE_STEPS}
+
+
+@pytest.mark.parametrize(
+    ("camera", "wrong"),
+    [
+        (RADIAL, ""),
+        # The corner is at 0.8 focal lengths: 0.8^4 k2 is 1 where the bound is, and the photo is ten times as wide.
+        (Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, 0.8**-4])), "k2 is at its bound"),
+        (Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, 0.9 * 0.8**-4])), ""),
+        (Camera("SIMPLE_RADIAL", 640, 480, np.array([500.0, 320, 240, -0.3])), "its distortion cannot be inverted"),
+        (as_model(PLAIN, "OPENCV_FISHEYE"), "the angles are not those of a fisheye"),
+        (replace(FISHEYE, params=FISHEYE.params * np.where(np.arange(8) < 2, 0.6, 1.0)), ""),
+    ],
+)
+def test_what_is_no_lens_is_told(camera, wrong):
+    """A barrel of k = -0.3 turns back where its radius is 0.70 focal lengths."""
+    told = what_is_wrong_with(camera, STEP[camera.model])
+    assert told.startswith(wrong)
+    assert bool(told) == bool(wrong)
+
+
+def test_a_bound_of_a_parameter_that_is_held_is_none():
+    at_bound = Camera("RADIAL", 640, 480, np.array([500.0, 320, 240, 0.1, 0.8**-4]))
+    assert what_is_wrong_with(at_bound, replace(STEP["RADIAL"], free=("f", "k1"))) == ""
+
+
+def test_priors_are_about_the_camera_that_is_given():
+    """Its focal lengths, their ratio and its principal point; wherever the camera has moved since."""
+    given = Camera("PINHOLE", 640, 480, np.array([500.0, 550.0, 300.0, 250.0]))
+    step = replace(STEP["OPENCV"], prior=first_step(given, 0.1).prior)
+    moved = Camera("OPENCV", 640, 480, np.array([510.0, 540.0, 310.0, 245.0, 0, 0, 0, 0]))
+    found = {(prior.param, prior.of): prior for prior in priors([moved], [step])}
+    assert found[0, None].mean == pytest.approx(500.0)
+    assert found[1, None].mean == pytest.approx(550.0)
+    assert found[0, 1].ratio == pytest.approx(500.0 / 550.0)
+    assert found[0, 1].sigma == pytest.approx(ASPECT_SIGMA * 510.0)
+    assert (found[2, None].mean, found[3, None].mean) == (300.0, 250.0)
+    assert found[2, None].sigma == PRINCIPAL_POINT_SIGMA * 640
+    # Two numbers of standard deviation s sqrt(2) have a mean of standard deviation s.
+    assert found[0, None].sigma == pytest.approx(0.1 * 500.0 * np.sqrt(2.0))
 
 
 def map_with(truth: Camera, start: Camera, **scene_options):

@@ -162,6 +162,7 @@ def test_the_choice_depends_on_no_draw(facade):
     first, again = (select_camera_models(sub_model.model, sub_model.calibration, refinement, OPTIONS) for _ in range(2))
     assert first == again
     assert sum(trial.accepted for trial in first[1]) == 1
+    assert "OPENCV_FISHEYE" not in {trial.step.model for trial in first[1]}  # 76 degrees from corner to corner
 
 
 def test_too_few_tracks_decide_nothing(facade):
