@@ -168,6 +168,14 @@ def test_cameras_that_are_assumed_make_a_model_weak():
     assert grade_run(run, graph, np.array([True]), OPTIONS, 0, 2).word == "good"
 
 
+@pytest.mark.parametrize(("sd_percent", "word"), [(0.3, "good"), (2.0, "weak")])
+def test_a_focal_length_with_a_large_standard_deviation_makes_a_model_weak(sd_percent, word):
+    model, graph = ordinary_building()
+    sd = 0.01 * sd_percent * float(model.cameras[0].params[0])
+    run = replace(run_of(model, graph), certainties=(CameraCertainty((sd,), "weak", "known roughly"),))
+    assert grade_run(run, graph, FREE, OPTIONS, 0, 2).word == word
+
+
 def test_an_alternative_makes_a_model_weak():
     model, graph = ordinary_building()
     assert grade_run(replace(run_of(model, graph), alternative=(model,)), graph, FREE, OPTIONS, 0, 2).word == "weak"

@@ -176,8 +176,7 @@ def _of_cameras(run: MappingRun, known: Bool[np.ndarray, "c"], options: GradingO
     """Cameras that the photos hardly determine, and cameras as nobody builds them."""
     model = run.reconstruction
     photos = [model.views[v].camera for v in model.registered().tolist()]
-    vague = [c for c in photos if c < len(run.certainties) and run.certainties[c].word != "well determined"]
-    vague = [c for c in vague if not known[c]]
+    vague = [c for c in photos if not known[c] and _is_vague(run, c, options.max_focal_sd)]
     if word := _word(len(vague) / len(photos), options.uncertain_cameras):
         yield GradeReason(
             word,
@@ -193,6 +192,15 @@ def _of_cameras(run: MappingRun, known: Bool[np.ndarray, "c"], options: GradingO
                 f"camera {c} has pixels that are not square: fx {fx:.6g}, fy {fy:.6g}",
                 "give its intrinsics, or check that the photos come from an ordinary lens and were not stretched",
             )
+
+
+def _is_vague(run: MappingRun, camera: int, max_focal_sd: float) -> bool:
+    """Whether a focal length was guessed, or is known to no better than a share of it."""
+    if camera >= len(run.certainties):
+        return False
+    certainty, params = run.certainties[camera], run.reconstruction.cameras[camera].params
+    sd = certainty.sds[0] if certainty.sds else None
+    return certainty.word == "assumed" if sd is None else sd > max_focal_sd * float(params[0])
 
 
 def _of_matches(table: _Table, options: GradingOptions) -> Iterator[GradeReason]:

@@ -42,6 +42,8 @@ class GradingOptions:
     """Share of photos whose pairs want another focal length."""
     uncertain_cameras: Limits = field(default_factory=lambda: Limits(1 / 3, 1.0))
     """Share of photos whose camera the photos do not determine well."""
+    max_focal_sd: float = 0.005
+    """Of a camera that is determined: standard deviation of its focal length, as a share of it."""
     left_out: Limits = field(default_factory=lambda: Limits(0.1, 1.0))
     """Share of pairs that mapping took to be false."""
     min_turn_deg: float = 3.0
