@@ -231,8 +231,21 @@ def test_a_pose_that_the_photos_of_a_model_contradict_is_refused():
     model = empty.with_pose(3, scene.truth.pose_of(3)).with_pose(4, scene.truth.pose_of(4))
     assert contradicts_pairs(model, graph, 5, scene.truth.pose_of(5)) == ""
     turned = scene.truth.pose_of(5) @ Rigid3(exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
-    assert "ask for another rotation" in contradicts_pairs(model, graph, 5, turned)
+    assert "ask for another pose" in contradicts_pairs(model, graph, 5, turned)
     assert "none of its photos" in contradicts_pairs(model, graph, 17, scene.truth.pose_of(17))
+
+
+def test_a_pose_is_not_refused_for_rotations_that_the_matches_of_their_pairs_deny():
+    """As of a plane, or of a focal length that was wrong: the pair's own pose is off, its matches are not."""
+    scene, graph = ring(looks=(0, 1, 2, 3))
+    empty = WorkingModel.start(scene.truth.cameras, np.zeros(28, dtype=np.int64), Observations.empty())
+    model = empty.with_pose(3, scene.truth.pose_of(3)).with_pose(4, scene.truth.pose_of(4))
+    turn = Rigid3(exp(np.array([0.0, 0.5, 0.0])), np.zeros(3))
+    turned = {
+        pair: replace(found, cam2_from_cam1=None if found.cam2_from_cam1 is None else turn @ found.cam2_from_cam1)
+        for pair, found in graph.two_views.items()
+    }
+    assert contradicts_pairs(model, graph.with_two_views(turned), 5, scene.truth.pose_of(5)) == ""
 
 
 def test_an_ordinary_ring_is_left_alone():

@@ -10,12 +10,11 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fieldstone.geometry.camera import plane_from_image
-from fieldstone.geometry.epipolar import essential_from_pose, homogeneous, sampson_error
+from fieldstone.geometry.epipolar import homogeneous
 from fieldstone.geometry.sim3 import Sim3
 from fieldstone.mapping.incremental.mapper import continue_with_graph
 from fieldstone.mapping.incremental.options import RETRY_STAGES, IncrementalOptions
-from fieldstone.mapping.incremental.registration import register_view
+from fieldstone.mapping.incremental.registration import epipolar_errors, register_view
 from fieldstone.mapping.incremental.state import SubModel, largest_first
 from fieldstone.mapping.model.refinement import adjust_globally
 from fieldstone.mapping.model.triangulation import plane_coordinates, retriangulate
@@ -217,11 +216,8 @@ def _seen_by(model: WorkingModel, views: Bool[np.ndarray, "v"]) -> Bool[np.ndarr
 def _agreeing(pair: ImagePair, model: WorkingModel, graph: MatchGraph) -> int:
     """Matches of a pair that agree with its poses in a model."""
     i, j = pair
-    pixels = graph.matched_pixels(pair)
-    rays1, rays2 = (homogeneous(plane_from_image(model.camera_of(v), px)) for v, px in zip(pair, pixels, strict=True))
-    E = essential_from_pose(model.pose_of(j) @ model.pose_of(i).inverse())
-    focal = float(np.sqrt(np.prod(model.scaled_focals()[[i, j]])))
-    return int(np.sum(focal * np.sqrt(sampson_error(E, rays1, rays2)) < MAX_LINK_ERROR_PX))
+    errors = epipolar_errors(model, graph, pair, model.pose_of(j) @ model.pose_of(i).inverse())
+    return int(np.sum(errors < MAX_LINK_ERROR_PX))
 
 
 def _with_points(model: WorkingModel, options: IncrementalOptions) -> WorkingModel:

@@ -6,16 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from fieldstone.geometry.camera import plane_from_image
+from fieldstone.geometry.epipolar import essential_from_pose, homogeneous, sampson_error
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import angle_between
 from fieldstone.mapping.model.working_model import WorkingModel
-from fieldstone.scene.match_graph import MatchGraph, TwoView
+from fieldstone.scene.match_graph import ImagePair, MatchGraph, TwoView
 from fieldstone.solve.robust.absolute_pose import estimate_absolute_pose
 from fieldstone.solve.robust.ransac import RansacOptions
 
 MAX_ROTATION_DIFFERENCE = float(np.deg2rad(15.0))
 """Pairs whose rotation differs by less agree with a pose."""
+MAX_EPIPOLAR_ERROR_PX = 4.0
+"""Matches whose Sampson error is smaller agree with a pose, times the pixel scale."""
 MAX_DOUBT = 0.2
 """Larger shares of matches that contradict a model tell of wrong cameras: false pairs were taken out before."""
 
@@ -52,7 +57,7 @@ def register_view(
 def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_from_world: Rigid3) -> str:
     """Why a pose of a photo cannot be, or an empty text.
 
-    Most matches with registered photos ask for another rotation, or there are none: where a scene repeats itself, a
+    Most matches with registered photos ask for another pose, or there are none: where a scene repeats itself, a
     few false matches turn the points of one place into those of another. Where many matches among the registered
     photos do so, pairs say nothing: their rotations come from cameras that the model has since refined.
     """
@@ -69,7 +74,7 @@ def contradicts_pairs(model: WorkingModel, graph: MatchGraph, view: int, cam_fro
     all_agree, all_differ = np.sum(of_others, axis=0)
     if all_differ > MAX_DOUBT * (all_agree + all_differ):
         return ""
-    return f"{differ} of {agree + differ} matches with its photos ask for another rotation"
+    return f"{differ} of {agree + differ} matches with its photos ask for another pose"
 
 
 def _registered_partners(model: WorkingModel, graph: MatchGraph, view: int) -> list[int]:
@@ -85,7 +90,11 @@ def _two_view(graph: MatchGraph, a: int, b: int) -> TwoView:
 def _agreement(
     model: WorkingModel, graph: MatchGraph, view: int, cam_from_world: Rigid3, partners: Sequence[int]
 ) -> tuple[int, int]:
-    """Matches of pairs that agree with a photo's rotation, or tell nothing of it; and of those that do not."""
+    """Matches of pairs that agree with a photo's pose, or tell nothing of it; and of those that do not.
+
+    Where the rotation of a pair differs, its matches have the last word: of a plane, or with a focal length that has
+    been refined since, the pair's own pose is no judge.
+    """
     agree, differ = 0, 0
     for partner in partners:
         two_view = _two_view(graph, view, partner)
@@ -94,8 +103,33 @@ def _agreement(
         if R is None or angle_between(R, cam_from_world.R) < MAX_ROTATION_DIFFERENCE:
             agree += inliers
         else:
-            differ += inliers
+            on_lines = _matches_on_epipolar_lines(model, graph, view, cam_from_world, partner)
+            agree, differ = agree + on_lines, differ + inliers - on_lines
     return agree, differ
+
+
+def epipolar_errors(
+    model: WorkingModel,
+    graph: MatchGraph,
+    pair: ImagePair,
+    cam2_from_cam1: Rigid3,
+    matches: Int[np.ndarray, "m 2"] | None = None,
+) -> Float[np.ndarray, "m"]:
+    """Sampson errors of a pair's matches (by default all putative ones), in pixels over the pixel scale."""
+    pixels = graph.matched_pixels(pair, matches)
+    rays = [homogeneous(plane_from_image(model.camera_of(v), p)) for v, p in zip(pair, pixels, strict=True)]
+    focal = float(np.sqrt(np.prod(model.scaled_focals()[list(pair)])))
+    return focal * np.sqrt(sampson_error(essential_from_pose(cam2_from_cam1), *rays))
+
+
+def _matches_on_epipolar_lines(
+    model: WorkingModel, graph: MatchGraph, view: int, cam_from_world: Rigid3, partner: int
+) -> int:
+    """How many inliers of a photo with a registered one agree with its pose."""
+    pair, poses = (min(view, partner), max(view, partner)), {view: cam_from_world, partner: model.pose_of(partner)}
+    cam2_from_cam1 = poses[pair[1]] @ poses[pair[0]].inverse()
+    errors = epipolar_errors(model, graph, pair, cam2_from_cam1, graph.inlier_matches(pair))
+    return int(np.sum(errors < MAX_EPIPOLAR_ERROR_PX))  # nan is not small
 
 
 def verdict_of_pairs(graph: MatchGraph, view: int) -> str:
