@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -32,6 +32,8 @@ from fieldstone.io.models.colmap import read_colmap
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
 from fieldstone.scene.reconstruction import Reconstruction
 from fieldstone.solve.robust.two_view import TwoViewOptions
+from fieldstone.synthetic.repeated_structure import RepeatedScene
+from fieldstone.synthetic.street import StreetOptions, synthesize_street
 from fieldstone.synthetic.symmetric import SymmetricOptions, synthesize_symmetric
 
 Half = Literal["develop", "confirm"]
@@ -92,10 +94,18 @@ def every_frame(film: Path, step: int, folder: Path) -> Path:
     return folder
 
 
-def four_fold_building(_: Path, **settings: float | bool) -> tuple[Input, Reconstruction | None]:
-    """Matches of a ring of photos around a building with four equal sides, see `synthetic.symmetric`."""
-    options = SymmetricOptions(points_per_side=300, **settings)  # pyright: ignore[reportArgumentType]
-    scene = synthesize_symmetric(options, np.random.default_rng(0))
+def four_fold_building(_: Path, **settings: Any) -> tuple[Input, Reconstruction | None]:
+    """Matches of a ring of photos around a building with sides that are the same, see `synthetic.symmetric`."""
+    return _matched(synthesize_symmetric(SymmetricOptions(points_per_side=300, **settings), np.random.default_rng(0)))
+
+
+def street_of_equal_houses(_: Path, **settings: Any) -> tuple[Input, Reconstruction | None]:
+    """Matches of photos along a row of houses that are the same, see `synthetic.street`."""
+    return _matched(synthesize_street(StreetOptions(**settings), np.random.default_rng(0)))
+
+
+def _matched(scene: RepeatedScene) -> tuple[Input, Reconstruction | None]:
+    """Verified matches with the camera known, and the truth."""
     one_camera = np.zeros(scene.graph.num_images, dtype=np.int64)
     graph = verify_pairs(scene.graph, scene.truth.cameras, one_camera, TwoViewOptions(), 0, 2)
     cameras = scene.truth.cameras
@@ -144,6 +154,13 @@ SETS: tuple[RealSet, ...] = (
     on_disk("opensfm_lund", "develop", 29, "opensfm_lund/images"),
     on_disk("unity_hall", "develop", 5, "unity_hall"),
     RealSet("four_fold", "develop", 28, partial(four_fold_building, unique_share=0.1), "similar"),
+    RealSet("street", "develop", 25, street_of_equal_houses, "similar"),
+    RealSet(
+        "front_and_back_alike", "confirm", 28,
+        partial(four_fold_building, looks=(0, 1, 0, 2), unique_share=0.2), "similar",
+    ),
+    RealSet("street_unique", "confirm", 25, partial(street_of_equal_houses, unique_share=0.3), "similar"),
+    RealSet("ordinary_street", "confirm", 25, partial(street_of_equal_houses, houses_differ=True), "similar"),
     on_disk(
         "strecha_fountain_p11", "confirm", 11, "strecha_fountain_p11/images", "metric", _strecha("strecha_fountain_p11")
     ),
