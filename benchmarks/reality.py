@@ -42,6 +42,8 @@ WRONG_DEG, WRONG_SHARE = 4.0, 0.1
 ERRORS = 0.25
 """How much an error against the truth scatters with the seed, as a share."""
 
+GRADES = {"good": 0, "weak": 1, "doubtful": 2}
+
 Verdict = Literal["right", "between", "wrong", "refused", ""]
 
 
@@ -247,6 +249,7 @@ def rows_of(outcome: Outcome) -> Iterator[Row]:
         ("wrong in largest", counts and counts.wrong_largest, "photos", "lower", QUALITY),
         ("right in all", counts and counts.right_all, "photos", "higher", QUALITY),
         ("wrong in all", counts and counts.wrong_all, "photos", "lower", QUALITY),
+        ("grade", GRADES.get(outcome.grade), "0 good, 1 weak, 2 doubtful", "lower", QUALITY),
         ("time", outcome.seconds, "s", "lower", TIMES),
     ]
     for metric, value, unit, better, tolerance in numbers:

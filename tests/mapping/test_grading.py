@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fieldstone.features.verification import verify_pairs
+from fieldstone.geometry.camera import Camera
 from fieldstone.geometry.epipolar import essential_from_pose
 from fieldstone.geometry.rigid3 import Rigid3
 from fieldstone.geometry.rotation import exp
@@ -235,6 +236,22 @@ def test_derivatives_agree_with_differences():
     J, h = jacobian(pose, columns), 1e-6
     numeric = np.stack([(errors(h * e) - errors(-h * e)) / (2 * h) for e in np.eye(7)], axis=1)
     np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_matches_at_both_epipoles_have_finite_derivatives():
+    pose = Rigid3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    columns = np.array([[0.0, 0.1], [0.0, 0.2], [0.0, 0.1], [0.0, 0.3], [1e-6, 1e-6], [1e-6, 1e-6]])
+    assert np.isfinite(jacobian(pose, columns)).all()
+
+
+def test_photos_at_one_place_and_lenses_without_an_inverse_are_passed_over():
+    model, graph = ordinary_building()
+    same = with_poses(
+        model, {1: replace(model.pose_of(1), t=model.pose_of(1).R @ -model.pose_of(0).target_origin_in_source())}
+    )
+    assert evidence_of_pairs(same, graph, [(0, 1)], TwoViewOptions(), 0, 1) == []
+    folding = Camera("SIMPLE_RADIAL", 1000, 750, np.array([800.0, 505.0, 370.0, -3.0]))
+    assert grade(replace(model, cameras=(folding,)), graph).word == "doubtful"
 
 
 def test_noise_alone_asks_for_no_other_focal_length():

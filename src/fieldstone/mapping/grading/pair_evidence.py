@@ -98,6 +98,7 @@ def evidence_of_pair(
     if own.inliers.sum() < options.min_inliers:
         return None
     columns = match_data(camera1, camera2, pixels1[own.inliers], pixels2[own.inliers], rng, pixel_scales).columns
+    columns = columns[:, np.isfinite(columns).all(axis=0)]  # where a lens model turns back, a pixel has no size
     cam2_from_cam1 = model.pose_of(pair[1]) @ model.pose_of(pair[0]).inverse()
     distance = float(np.linalg.norm(cam2_from_cam1.t))
     if columns.shape[1] < options.min_inliers or distance == 0.0:
@@ -186,7 +187,7 @@ def jacobian(pose: Rigid3, columns: Float[np.ndarray, "6 n"]) -> Float[np.ndarra
     Ex2, Ety2 = columns[5, :, None] * Ex[:, :2], columns[4, :, None] * Ety[:, :2]
     half = np.einsum("nki,ni->nk", p, Ex2) + np.einsum("nki,ni->nk", q, Ety2)
     dC = (y[:, :, None] * x[:, None, :]).reshape(-1, 9) @ dE.reshape(7, 9).T
-    return dC / D[:, None] - (C / D**3)[:, None] * half
+    return dC / D[:, None] - (C / D)[:, None] * (half / D[:, None] ** 2)  # D^3 may underflow at an epipole
 
 
 def moved(pose: Rigid3, step: Float[np.ndarray, "5"]) -> Rigid3:
