@@ -154,6 +154,7 @@ def test_the_equivalent_of_some_makers_counts_digital_zoom(tmp_path):
         save_with_exif(tmp_path / "a.jpg", f35=52, zoom=IFDRational(2), make=make).focal_px
         for make in ("Apple", "ACME")
     )
+    assert counted is not None
     assert not_counted == pytest.approx(2 * counted)
 
 
