@@ -109,7 +109,7 @@ def _matched(scene: RepeatedScene) -> tuple[Input, Reconstruction | None]:
     one_camera = np.zeros(scene.graph.num_images, dtype=np.int64)
     graph = verify_pairs(scene.graph, scene.truth.cameras, one_camera, TwoViewOptions(), 0, 2)
     cameras = scene.truth.cameras
-    matched = MatchedPhotos(graph, cameras, one_camera, np.array([True]), lambda name: None, (), {})
+    matched = MatchedPhotos(graph, cameras, one_camera, np.zeros(1), lambda name: None, (), {})
     return matched, posed([v.name for v in scene.truth.views], [cameras[0]] * graph.num_images, poses_of(scene.truth))
 
 

@@ -9,6 +9,7 @@ from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.model.calibration import (
     ASPECT_SIGMA,
     CANDIDATE_STEPS,
+    FOCAL_SIGMA,
     PRINCIPAL_POINT_SIGMA,
     as_model,
     first_step,
@@ -125,12 +126,20 @@ def test_priors_are_about_the_camera_that_is_given():
     assert found[0, None].sigma == pytest.approx(0.1 * 500.0 * np.sqrt(2.0))
 
 
-def map_with(truth: Camera, start: Camera, **scene_options):
+def map_with(truth: Camera, start: Camera, focal_sigma: float = FOCAL_SIGMA, **scene_options):
     options = {"num_cameras": 10, "num_points": 1200, "layout": "arc", "noise_px": 0.3, "camera": truth}
     scene = synthesize(SceneOptions(**(options | scene_options)), np.random.default_rng(0))
     camera_of_image = np.zeros(scene.graph.num_images, dtype=np.int64)
     graph = verify_pairs(scene.graph, [start], camera_of_image, TwoViewOptions(), 0, 2)
-    return scene, map_automatic(graph, [start], camera_of_image, np.array([False]), AutomaticOptions(), 0)
+    return scene, map_automatic(graph, [start], camera_of_image, np.array([focal_sigma]), AutomaticOptions(), 0)
+
+
+def test_photos_overrule_a_prior_of_the_focal_length_as_far_as_it_is_wide():
+    """Where they tell it; a prior that is narrower than what they tell is kept."""
+    truth, start = (Camera("SIMPLE_PINHOLE", 1000, 750, np.array([f, 500.0, 375.0])) for f in (800.0, 832.0))
+    found = [map_with(truth, start, sigma)[1].reconstruction.cameras[0].focal[0] for sigma in (FOCAL_SIGMA, 0.05, 1e-6)]
+    assert found[:2] == pytest.approx([800.0, 800.0], rel=0.003)
+    assert found[2] == pytest.approx(832.0, rel=0.001)
 
 
 def test_given_fisheye_cameras_are_refined():

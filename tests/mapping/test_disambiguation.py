@@ -40,13 +40,13 @@ DEFAULT = DisambiguationOptions()
 
 
 def resolve(scene: RepeatedScene, graph: MatchGraph, options: DisambiguationOptions = DEFAULT) -> Disambiguation:
-    one_camera, known = np.zeros(graph.num_images, dtype=np.int64), np.array([True])
-    return place(graph, scene.truth.cameras, one_camera, known, AutomaticOptions(disambiguation=options), 0)
+    one_camera, exact = np.zeros(graph.num_images, dtype=np.int64), np.zeros(1)
+    return place(graph, scene.truth.cameras, one_camera, exact, AutomaticOptions(disambiguation=options), 0)
 
 
 def map_ring(scene: RepeatedScene, graph: MatchGraph) -> MappingRun:
     one_camera = np.zeros(graph.num_images, dtype=np.int64)
-    return map_automatic(graph, scene.truth.cameras, one_camera, np.array([True]), AutomaticOptions(), 0)
+    return map_automatic(graph, scene.truth.cameras, one_camera, np.zeros(1), AutomaticOptions(), 0)
 
 
 def agreeing_pairs(graph: MatchGraph) -> set[tuple[int, int]]:

@@ -13,7 +13,7 @@ GLOBAL = AutomaticOptions(mapper="global")
 
 def mapped(graph: MatchGraph, cameras, camera_of_image, options=GLOBAL):
     graph = verify_pairs(graph, cameras, camera_of_image, TwoViewOptions(), 0, 2)
-    return map_automatic(graph, cameras, camera_of_image, np.array([True] * len(cameras)), options, 0)
+    return map_automatic(graph, cameras, camera_of_image, np.zeros(len(cameras)), options, 0)
 
 
 @pytest.mark.parametrize("layout", ["arc", "ring"])

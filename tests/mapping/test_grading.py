@@ -38,7 +38,7 @@ def ordinary_building() -> tuple[Reconstruction, MatchGraph]:
     scene = synthesize_symmetric(options, np.random.default_rng(0))
     one_camera = np.zeros(PHOTOS, dtype=np.int64)
     graph = verify_pairs(scene.graph, scene.truth.cameras, one_camera, TwoViewOptions(), 0, 2)
-    run = map_automatic(graph, scene.truth.cameras, one_camera, np.array([True]), AutomaticOptions(), 0)
+    run = map_automatic(graph, scene.truth.cameras, one_camera, np.zeros(1), AutomaticOptions(), 0)
     assert len(run.reconstruction.registered()) == PHOTOS
     return run.reconstruction, graph
 

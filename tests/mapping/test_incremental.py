@@ -8,6 +8,7 @@ from fieldstone.geometry.camera import Camera, image_from_cam
 from fieldstone.mapping.automatic import AutomaticOptions, map_automatic
 from fieldstone.mapping.incremental.options import IncrementalOptions
 from fieldstone.mapping.model import refinement
+from fieldstone.mapping.model.calibration import FOCAL_SIGMA
 from fieldstone.mapping.model.refinement import RefinementOptions
 from fieldstone.mapping.model.triangulation import covering_tracks, retriangulate
 from fieldstone.mapping.model.working_model import WorkingModel
@@ -32,7 +33,9 @@ def map_scene(scene: SyntheticScene, cameras, known: bool, seed: int = 0, graph:
     graph = graph or scene.graph
     camera_of_image = np.zeros(graph.num_images, dtype=np.int64)
     graph = verify_pairs(graph, cameras, camera_of_image, TwoViewOptions(), seed, 2)
-    return map_automatic(graph, cameras, camera_of_image, np.array([known]), AutomaticOptions(), seed)
+    return map_automatic(
+        graph, cameras, camera_of_image, np.array([0.0 if known else FOCAL_SIGMA]), AutomaticOptions(), seed
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -80,14 +83,14 @@ def test_photos_that_share_no_camera_are_calibrated_each_on_its_own():
     off = np.linspace(0.92, 1.08, 8)
     cameras = tuple(Camera("SIMPLE_PINHOLE", 1000, 750, np.array([800.0 * share, 500.0, 375.0])) for share in off)
     graph = verify_pairs(scene.graph, cameras, np.arange(8), TwoViewOptions(), 0, 2)
-    run = map_automatic(graph, cameras, np.arange(8), np.zeros(8, dtype=bool), AutomaticOptions(), 0)
+    run = map_automatic(graph, cameras, np.arange(8), np.full(8, FOCAL_SIGMA), AutomaticOptions(), 0)
     found = np.array([camera.focal.mean() for camera in run.reconstruction.cameras])
     np.testing.assert_allclose(found / 800, 1.0, atol=0.01)
 
 
 def test_result_is_the_same_for_any_number_of_threads(monkeypatch):
     scene = scene_of(outlier_share=0.2)
-    camera_of_image, known = np.zeros(8, dtype=np.int64), np.array([False])
+    camera_of_image, focal_sigma = np.zeros(8, dtype=np.int64), np.array([FOCAL_SIGMA])
     refinement_options = RefinementOptions(min_observations_for_threads=0)
     options = AutomaticOptions(incremental=IncrementalOptions(refinement=refinement_options))
     runs, threads_used = [], []
@@ -99,7 +102,8 @@ def test_result_is_the_same_for_any_number_of_threads(monkeypatch):
     monkeypatch.setattr(refinement, "bundle_adjust", adjust)
     for threads in (1, 3):
         graph = verify_pairs(scene.graph, scene.truth.cameras, camera_of_image, TwoViewOptions(), 5, threads)
-        runs.append(map_automatic(graph, scene.truth.cameras, camera_of_image, known, options.with_threads(threads), 5))
+        each = options.with_threads(threads)
+        runs.append(map_automatic(graph, scene.truth.cameras, camera_of_image, focal_sigma, each, 5))
     assert set(threads_used) == {1, 3}
     first, second = (run.reconstruction for run in runs)
     np.testing.assert_array_equal(first.points.xyz, second.points.xyz)
@@ -109,10 +113,10 @@ def test_result_is_the_same_for_any_number_of_threads(monkeypatch):
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_progress_counts_photos_and_models(mapper):
     scene, events = scene_of(), []
-    camera_of_image, known = np.zeros(8, dtype=np.int64), np.array([True])
+    camera_of_image, exact = np.zeros(8, dtype=np.int64), np.zeros(1)
     graph = verify_pairs(scene.graph, scene.truth.cameras, camera_of_image, TwoViewOptions(), 0, 2, events.append)
     options = AutomaticOptions(mapper=mapper)
-    map_automatic(graph, scene.truth.cameras, camera_of_image, known, options, 0, on_progress=events.append)
+    map_automatic(graph, scene.truth.cameras, camera_of_image, exact, options, 0, on_progress=events.append)
     assert list(dict.fromkeys(e.stage for e in events)) == ["verifying pairs", "registering photos", "finishing models"]
     for stage, total in (("verifying pairs", len(graph.matches)), ("registering photos", 8), ("finishing models", 1)):
         done = [e.done for e in events if e.stage == stage]
@@ -133,9 +137,9 @@ def test_photos_of_more_pixels_than_the_detector_saw_give_the_same_model(mapper)
     )
     camera_of_image, options = (zoom == 3.0).astype(np.int64), AutomaticOptions(mapper=mapper, covariance=True)
     graph = verify_pairs(larger, cameras, camera_of_image, TwoViewOptions(), 0, 2)
-    run = map_automatic(graph, cameras, camera_of_image, np.array([True, True]), options, 0)
+    run = map_automatic(graph, cameras, camera_of_image, np.zeros(2), options, 0)
     plain = verify_pairs(scene.graph, [OFF_CENTER] * 2, camera_of_image, TwoViewOptions(), 0, 2)
-    expected = map_automatic(plain, [OFF_CENTER] * 2, camera_of_image, np.array([True, True]), options, 0)
+    expected = map_automatic(plain, [OFF_CENTER] * 2, camera_of_image, np.zeros(2), options, 0)
     assert_reconstruction_near(run.reconstruction, expected.reconstruction, angle_deg=1e-4, relative_distance=1e-5)
     assert len(run.reconstruction.observations) == len(expected.reconstruction.observations)
     assert run.uncertainty is not None

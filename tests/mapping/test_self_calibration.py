@@ -11,7 +11,13 @@ from fieldstone.mapping import automatic
 from fieldstone.mapping.automatic import AutomaticOptions, FinishedModel, finish, register
 from fieldstone.mapping.incremental.state import SubModel
 from fieldstone.mapping.model import calibration as calibration_module
-from fieldstone.mapping.model.calibration import CANDIDATE_STEPS, CalibrationStep, LensPrior, with_free_aspect
+from fieldstone.mapping.model.calibration import (
+    CANDIDATE_STEPS,
+    FOCAL_SIGMA,
+    CalibrationStep,
+    LensPrior,
+    with_free_aspect,
+)
 from fieldstone.mapping.model.refinement import RefinementOptions, adjust_globally
 from fieldstone.mapping.model.uncertainty import camera_certainties
 from fieldstone.mapping.self_calibration import (
@@ -82,7 +88,7 @@ def registered(truth: Camera, seed: int = 0, **scene_options) -> tuple[Synthetic
     scene = synthesize(SceneOptions(**options), np.random.default_rng(seed))
     one = np.zeros(scene.graph.num_images, dtype=np.int64)
     graph = verify_pairs(scene.graph, [PLAIN], one, TwoViewOptions(), 0, 2)
-    return scene, register(graph, [PLAIN], one, np.array([False]), AutomaticOptions(), 0)[0]
+    return scene, register(graph, [PLAIN], one, np.array([FOCAL_SIGMA]), AutomaticOptions(), 0)[0]
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,6 @@ def test_relative_poses_give_the_pose(scene):
 
 def test_a_photo_without_points_is_registered(scene):
     graph = verified(scene, with_lonely_last(scene))
-    run = map_automatic(graph, scene.truth.cameras, ONE_CAMERA, np.array([True]), AutomaticOptions(), 0)
+    run = map_automatic(graph, scene.truth.cameras, ONE_CAMERA, np.zeros(1), AutomaticOptions(), 0)
     assert "relative poses" in run.verdicts[graph.names[LAST]]
     assert_reconstruction_near(run.reconstruction, scene.truth, angle_deg=0.3, relative_distance=0.01)

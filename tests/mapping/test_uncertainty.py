@@ -20,9 +20,9 @@ def runs():
     for seed in range(3):
         options = SceneOptions(num_cameras=8, num_points=250, layout="arc", noise_px=0.6)
         scene = synthesize(options, np.random.default_rng(seed))
-        one, known = np.zeros(8, dtype=np.int64), np.array([True])
+        one, exact = np.zeros(8, dtype=np.int64), np.zeros(1)
         graph = verify_pairs(scene.graph, scene.truth.cameras, one, TwoViewOptions(), 0, 1)
-        out.append((scene, map_automatic(graph, scene.truth.cameras, one, known, AutomaticOptions(covariance=True), 0)))
+        out.append((scene, map_automatic(graph, scene.truth.cameras, one, exact, AutomaticOptions(covariance=True), 0)))
     return out
 
 
@@ -87,7 +87,7 @@ def test_covariances_are_symmetric_and_positive_and_only_on_request(runs):
         assert np.all(np.linalg.eigvalsh(blocks) > -1e-12)
     assert len(run.uncertainty.of_points) == len(run.reconstruction.points)
     graph, cameras, one = run.graph, scene.truth.cameras, np.zeros(8, dtype=np.int64)
-    plain = map_automatic(graph, cameras, one, np.array([True]), replace(AutomaticOptions(), covariance=False), 0)
+    plain = map_automatic(graph, cameras, one, np.zeros(1), replace(AutomaticOptions(), covariance=False), 0)
     assert plain.uncertainty is None
 
 
@@ -97,7 +97,7 @@ def test_a_model_too_large_for_a_covariance_is_a_model_and_a_note(runs, monkeypa
     monkeypatch.setattr(covariance, "MAX_COLUMNS", 47)
     one = np.zeros(8, dtype=np.int64)
     options = AutomaticOptions(covariance=True)
-    without = map_automatic(run.graph, scene.truth.cameras, one, np.array([True]), options, 0)
+    without = map_automatic(run.graph, scene.truth.cameras, one, np.zeros(1), options, 0)
     assert without.uncertainty is None
     np.testing.assert_array_equal(without.reconstruction.points.xyz, run.reconstruction.points.xyz)
     assert [note for note in without.notes if "no covariance" in note and "47 are allowed" in note]

@@ -55,7 +55,7 @@ def without_last(scene: SyntheticScene) -> MatchGraph:
 
 
 def placed(scene: SyntheticScene, graph: MatchGraph) -> Disambiguation:
-    return place(graph, scene.truth.cameras, ONE_CAMERA, np.array([True]), AutomaticOptions(), 0)
+    return place(graph, scene.truth.cameras, ONE_CAMERA, np.zeros(1), AutomaticOptions(), 0)
 
 
 def test_a_photo_whose_pairs_were_not_chosen_is_registered(scene):

@@ -6,6 +6,7 @@ import pytest
 from fieldstone.features.verification import verify_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.automatic import AutomaticOptions, register
+from fieldstone.mapping.model.calibration import FOCAL_SIGMA
 from fieldstone.run.map_photos import map_photos
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
@@ -29,19 +30,19 @@ def matched(scene: SyntheticScene, focal: float) -> MatchedPhotos:
     """The photos as they would be verified with a focal length that somebody guessed."""
     cameras = tuple(replace(camera, params=np.array([focal, 500.0, 375.0])) for camera in scene.truth.cameras)
     graph = verify_pairs(scene.graph, cameras, ONE_CAMERA, OPTIONS.two_view, 0, 1)
-    return MatchedPhotos(graph, cameras, ONE_CAMERA, np.array([False]), lambda name: None, (), {})
+    return MatchedPhotos(graph, cameras, ONE_CAMERA, np.array([FOCAL_SIGMA]), lambda name: None, (), {})
 
 
 def test_pairs_are_verified_with_the_focal_length_that_a_model_found(scene):
     wrong, right = matched(scene, FOCAL / 3), matched(scene, FOCAL)
-    models = register(right.graph, right.cameras, ONE_CAMERA, right.known, MAPPING, 0)
+    models = register(right.graph, right.cameras, ONE_CAMERA, right.focal_sigma, MAPPING, 0)
     again = with_cameras_of_models(wrong, models, OPTIONS, 0)
     assert again is not None
     np.testing.assert_allclose(again.cameras[0].params, [FOCAL, 500.0, 375.0], rtol=0.01)
     total = sum(len(rows) for rows in again.graph.matches.values())
     agree = sum(int(two_view.inliers.sum()) for two_view in again.graph.two_views.values())
     assert agree > 0.98 * total
-    known = replace(wrong, known=np.array([True]))
+    known = replace(wrong, focal_sigma=np.zeros(1))
     assert with_cameras_of_models(known, models, OPTIONS, 0) is None
     assert with_cameras_of_models(right, models, OPTIONS, 0) is None
     assert with_cameras_of_models(wrong, [], OPTIONS, 0) is None

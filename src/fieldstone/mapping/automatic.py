@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Float, Int
 
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.disambiguation.disambiguate import Disambiguation, disambiguate
@@ -85,7 +85,7 @@ def map_automatic(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
-    known: Bool[np.ndarray, "c"],
+    focal_sigma: Float[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
     store: CheckpointStore | None = None,
@@ -95,11 +95,12 @@ def map_automatic(
 
     Args:
         graph: Verified, see `features.verification`.
-        known: Cameras whose intrinsics are exact and stay as they are; the others are refined.
+        focal_sigma: By what share the focal length of each camera may be off: a standard deviation. 0: its intrinsics
+            are exact and stay as they are; the others are refined.
         store: Where a registration that was stopped is taken up again.
         on_progress: Told of registered photos and finished models.
     """
-    found = place(graph, cameras, camera_of_image, known, options, seed, store, on_progress)
+    found = place(graph, cameras, camera_of_image, focal_sigma, options, seed, store, on_progress)
     return finish_all(found, cameras, camera_of_image, options, on_progress)
 
 
@@ -107,7 +108,7 @@ def place(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
-    known: Bool[np.ndarray, "c"],
+    focal_sigma: Float[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
     store: CheckpointStore | None = None,
@@ -116,7 +117,7 @@ def place(
     """The registered sub-models that the photos speak for; arguments as `map_automatic`."""
 
     def register_graph(graph: MatchGraph) -> list[SubModel]:
-        return register(graph, cameras, camera_of_image, known, options, seed, store, on_progress)
+        return register(graph, cameras, camera_of_image, focal_sigma, options, seed, store, on_progress)
 
     return disambiguate(graph, cameras, camera_of_image, register_graph, options.disambiguation)
 
@@ -125,14 +126,17 @@ def register(
     graph: MatchGraph,
     cameras: Sequence[Camera],
     camera_of_image: Int[np.ndarray, "n"],
-    known: Bool[np.ndarray, "c"],
+    focal_sigma: Float[np.ndarray, "c"],
     options: AutomaticOptions,
     seed: int,
     store: CheckpointStore | None = None,
     on_progress: OnProgress = silent,
 ) -> list[SubModel]:
     """The sub-models of a graph, the one with most photos first; arguments as `map_automatic`."""
-    calibration = [None if known[c] else first_step(camera) for c, camera in enumerate(cameras)]
+    calibration = [
+        None if sigma == 0.0 else first_step(camera, sigma)
+        for camera, sigma in zip(cameras, focal_sigma.tolist(), strict=True)
+    ]
     start_cameras = with_models(cameras, calibration)
     mapper = map_global if options.mapper == "global" else map_incremental
     found = mapper(graph, start_cameras, camera_of_image, calibration, options.incremental, seed, store, on_progress)

@@ -44,11 +44,11 @@ def map_photos(
         store: Where a registration that was stopped is taken up again.
     """
     cameras, camera_of_image = matched.cameras, matched.camera_of_image
-    found = place(matched.graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    found = place(matched.graph, cameras, camera_of_image, matched.focal_sigma, options, seed, store, on_progress)
     again = with_cameras_of_models(matched, found.sub_models, matching, seed)
     if again is not None:
         matched, cameras = again, again.cameras
-        found = place(matched.graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+        found = place(matched.graph, cameras, camera_of_image, matched.focal_sigma, options, seed, store, on_progress)
     if matched.photos and not found.left_out.any():  # matching anew would find again what was left out
         stages = Rematcher(matched.photos, camera_of_image, matching, seed).stages()
         found = recover(found, stages, options.incremental, seed, store, on_progress)
@@ -74,7 +74,7 @@ def map_given_matches(
         return mapper, map_with_textbook(matched, textbook, seed, on_progress)
     graph, cameras, camera_of_image = matched.graph, matched.cameras, matched.camera_of_image
     graph = verify_pairs(graph, cameras, camera_of_image, matching.two_view, seed, matching.threads, on_progress)
-    found = place(graph, cameras, camera_of_image, matched.known, options, seed, store, on_progress)
+    found = place(graph, cameras, camera_of_image, matched.focal_sigma, options, seed, store, on_progress)
     if mapper == "auto" and not found.notes:
         return "textbook", map_with_textbook(matched, textbook, seed, on_progress)
     return options.mapper, finish_all(found, cameras, camera_of_image, options, on_progress)

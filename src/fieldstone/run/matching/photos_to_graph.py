@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from fieldstone.errors import InputError
 from fieldstone.features.pairs import choose_pairs
@@ -18,6 +18,7 @@ from fieldstone.geometry.camera import Camera
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import read_given_matches
 from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
+from fieldstone.mapping.model.calibration import FOCAL_SIGMA
 from fieldstone.progress import OnProgress, silent
 from fieldstone.report.figures import PhotoByName
 from fieldstone.report.raster import DRAWN_PX
@@ -42,8 +43,8 @@ class MatchedPhotos:
     graph: MatchGraph
     cameras: tuple[Camera, ...]
     camera_of_image: Int[np.ndarray, "n"]
-    known: Bool[np.ndarray, "c"]
-    """Cameras whose intrinsics are exact."""
+    focal_sigma: Float[np.ndarray, "c"]
+    """By what share the focal length of each camera may be off: a standard deviation; 0: its intrinsics are exact."""
     photo_of: PhotoByName
     problems: tuple[PhotoProblem, ...]
     seconds: Mapping[str, float]
@@ -53,6 +54,11 @@ class MatchedPhotos:
     """Of photos by name, see `detection.sharpness`."""
     notes: Sequence[str] = ()
     """What a user should know of how the cameras were found."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, "c"]:
+        """Cameras whose intrinsics are exact."""
+        return self.focal_sigma == 0.0
 
 
 def read_matched_photos(folder: Path) -> MatchedPhotos:
@@ -64,7 +70,7 @@ def read_matched_photos(folder: Path) -> MatchedPhotos:
         graph=given.graph,
         cameras=(camera,),
         camera_of_image=np.zeros(given.graph.num_images, dtype=np.int64),
-        known=np.array([True]),
+        focal_sigma=np.zeros(1),
         photo_of=photos_on_disk([path for path in given.photos if path is not None]),
         problems=given.problems,
         seconds={"reading": time.perf_counter() - start},
@@ -103,14 +109,14 @@ def match_photos(
     cameras, camera_of_image = found.cameras, found.camera_of_image
     graph = verify(graph, photos, cameras, camera_of_image, options, seed, cache, on_progress)
     stop("verification")
-    known = np.array([options.fix_intrinsics and source == "given" for source in found.source])
+    exact = np.array([options.fix_intrinsics and source == "given" for source in found.source])
     photo_of = photos_on_disk([info.path for info in infos])
     sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
     return MatchedPhotos(
         graph,
         cameras,
         camera_of_image,
-        known,
+        np.where(exact, 0.0, np.minimum(found.focal_sigma, FOCAL_SIGMA)),
         photo_of,
         tuple(problems),
         seconds,

@@ -11,6 +11,7 @@ import numpy as np
 from fieldstone.features.verification import two_views_of_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.mapping.incremental.state import SubModel
+from fieldstone.mapping.model.calibration import FOCAL_SIGMA
 from fieldstone.run.matching.options import MatchingOptions
 from fieldstone.run.matching.photos_to_graph import MatchedPhotos
 
@@ -42,7 +43,11 @@ def with_cameras_of_models(
     again = graph.with_two_views({**graph.two_views, **dict(zip(pairs, found, strict=True))})
     before, after = (sum(int(g.two_views[pair].inliers.sum()) for pair in pairs) for g in (graph, again))
     logger.info("with the focal lengths of the model %d matches agree instead of %d", after, before)
-    return replace(matched, graph=again, cameras=cameras) if after > MIN_GAIN * before else None
+    if after <= MIN_GAIN * before:
+        return None
+    sigma = matched.focal_sigma.copy()
+    sigma[sorted(changed)] = FOCAL_SIGMA  # what was known before is not true
+    return replace(matched, graph=again, cameras=cameras, focal_sigma=sigma)
 
 
 def _cameras_of(matched: MatchedPhotos, sub_models: Sequence[SubModel]) -> tuple[tuple[Camera, ...], set[int]]:
