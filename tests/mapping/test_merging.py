@@ -80,3 +80,15 @@ def test_halves_that_see_each_other_in_wrong_places_stay_two(scene):
     bent = replace(second, model=replace(second.model, xyz=xyz))
     assert len(merge_linked([first, second], graph, OPTIONS, 0)) == 1
     assert len(merge_linked([first, bent], graph, OPTIONS, 0)) == 2
+
+
+def test_halves_that_see_each_other_in_two_places_stay_two(scene):
+    """As along a row of equal houses: half of the points that are seen lie as if one half were a house further."""
+    graph = in_two_halves(scene, true_link(scene))
+    first, second = halves(scene, graph)
+    seen = np.unique(first.model.tracks.point[first.model.tracks.view < HALF])
+    seen = seen[second.model.is_point()[seen]]
+    xyz = second.model.xyz.copy()
+    xyz[seen[::2]] += xyz[seen].std(axis=0)
+    elsewhere = replace(second, model=replace(second.model, xyz=xyz))
+    assert len(merge_linked([first, elsewhere], graph, OPTIONS, 0)) == 2

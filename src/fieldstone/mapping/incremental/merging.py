@@ -20,7 +20,7 @@ from fieldstone.mapping.model.refinement import adjust_globally
 from fieldstone.mapping.model.triangulation import plane_coordinates, retriangulate
 from fieldstone.mapping.model.working_model import WorkingModel
 from fieldstone.scene.match_graph import ImagePair, MatchGraph
-from fieldstone.solve.robust.frame_similarity import Sightings, estimate_frame_similarity
+from fieldstone.solve.robust.frame_similarity import COARSE_FACTOR, Sightings, errors_px, estimate_frame_similarity
 from fieldstone.solve.robust.two_view import TwoViewOptions, estimate_two_view
 
 logger = logging.getLogger(__name__)
@@ -37,6 +37,8 @@ MIN_SIGHTINGS = 8
 """Photos of either model that see points of the other where they should."""
 MIN_SIGHTINGS_SHARE = 0.6
 """Of all sightings, as many must agree: photos of look-alikes see points of each other too, all over the place."""
+RIVAL_SHARE = 0.25
+"""Sightings that agree with another place, over those that agree with the best, from which on neither is believed."""
 MIN_SHARED_POINTS = 20
 """Points that photos of both see."""
 MIN_KEPT_POINTS = 0.9
@@ -96,8 +98,8 @@ def merge(
 ) -> SubModel | None:
     """Two sub-models on the same tracks in one; None if they do not fit together.
 
-    They fit if photos of the one see points of the other where they should, if hardly a point is lost and many are
-    there that photos of both see, and if matches between them agree with the result.
+    They fit if photos of the one see points of the other where they should, and in no other place; if hardly a point
+    is lost and many are there that photos of both see; and if matches between them agree with the result.
     """
     if min(a.num_registered, b.num_registered) < MIN_PHOTOS:
         return None
@@ -106,8 +108,18 @@ def merge(
     if not links:
         return None
     rotations = [link.a_R_b for link in links[:MAX_LINKS]] + _rotations_by_points(a.model, b.model, options, rng)
-    found = estimate_frame_similarity(sightings, np.array(rotations), options.pnp.max_error_px, rng)
+    limit = options.pnp.max_error_px
+    found = estimate_frame_similarity(sightings, np.array(rotations), limit, rng)
     if found is None or found.inliers.sum() < max(MIN_SIGHTINGS, MIN_SIGHTINGS_SHARE * len(sightings)):
+        return None
+    # Where places look alike, what disagrees is of one mind too.
+    rest = sightings.select(errors_px(found.a_from_b, sightings) >= COARSE_FACTOR * limit)
+    rival = estimate_frame_similarity(rest, np.array(rotations), limit, rng)
+    if rival is not None and rival.inliers.sum() >= max(MIN_SIGHTINGS, RIVAL_SHARE * found.inliers.sum()):
+        logger.info(
+            "sub-models of %d and %d photos: %d of %d sightings agree with one place, %d with another",
+            a.num_registered, b.num_registered, found.inliers.sum(), len(sightings), rival.inliers.sum(),
+        )  # fmt: skip
         return None
     model = _with_points(united(a.model, b.model, found.a_from_b), options)
     for _ in range(2):
