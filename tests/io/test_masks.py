@@ -1,6 +1,7 @@
 """Masks: which file belongs to which photo, what is kept, what is refused."""
 
 import logging
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +20,12 @@ def photo(tmp_path):
     return path
 
 
+def named(*photos: Path) -> dict[str, Path]:
+    return {photo.name: photo for photo in photos}
+
+
 def write_mask(path, values):
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.asarray(values, dtype=np.uint8)).save(path)
 
 
@@ -28,7 +33,17 @@ def write_mask(path, values):
 def test_the_usual_names_are_found(tmp_path, photo, name):
     write_mask(tmp_path / "masks" / name, np.full((6, 8), 255))
     write_mask(tmp_path / "masks" / "b.png", np.zeros((3, 3)))
-    assert find_masks(tmp_path / "masks", [photo]) == {photo: tmp_path / "masks" / name}
+    assert find_masks(tmp_path / "masks", named(photo)) == {photo: tmp_path / "masks" / name}
+
+
+def test_photos_of_one_name_in_two_folders_have_masks_of_their_own(tmp_path):
+    photos = {f"{side}/a.jpg": tmp_path / "photos" / side / "a.jpg" for side in ("left", "right")}
+    for name, path in photos.items():
+        path.parent.mkdir(parents=True)
+        write_photo(path, np.zeros((6, 8, 3), dtype=np.uint8))
+        write_mask(tmp_path / "masks" / f"{name}.png", np.full((6, 8), 255))
+    found = find_masks(tmp_path / "masks", photos)
+    assert found == {path: tmp_path / "masks" / f"{name}.png" for name, path in photos.items()}
 
 
 def test_white_is_kept_whatever_the_grey_levels(tmp_path, photo):
@@ -62,20 +77,20 @@ def test_wrong_sizes_are_one_error(tmp_path, photo):
     for name in ("a.png", "b.png"):
         write_mask(tmp_path / "masks" / name, np.zeros((8, 6)))
     with pytest.raises(InputError, match=r"a.png: 6 x 8 for a photo of 8 x 6, and 1 more like it"):
-        find_masks(tmp_path / "masks", [photo, other])
+        find_masks(tmp_path / "masks", named(photo, other))
     with pytest.raises(InputError, match="another size"):
         read_mask(tmp_path / "masks" / "a.png", read_photo_info(photo))
 
 
 def test_missing_masks(tmp_path, photo, caplog):
     with pytest.raises(InputError, match="no such folder"):
-        find_masks(tmp_path / "masks", [photo])
+        find_masks(tmp_path / "masks", named(photo))
     (tmp_path / "masks").mkdir()
     with pytest.raises(InputError, match=r"looked for as a.jpg.png, a.jpg or a.png"):
-        find_masks(tmp_path / "masks", [photo])
+        find_masks(tmp_path / "masks", named(photo))
     write_mask(tmp_path / "masks" / "a.png", np.zeros((6, 8)))
     with caplog.at_level(logging.WARNING):
-        assert list(find_masks(tmp_path / "masks", [photo, photo.with_name("b.jpg")])) == [photo]
+        assert list(find_masks(tmp_path / "masks", named(photo, photo.with_name("b.jpg")))) == [photo]
     assert "1 of 2 photos have no mask" in caplog.text
 
 

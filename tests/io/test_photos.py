@@ -16,6 +16,7 @@ from fieldstone.io.images import photos as photos_module
 from fieldstone.io.images.photos import (
     list_photos,
     natural_key,
+    photo_name,
     read_photo,
     read_photo_info,
     write_photo,
@@ -190,6 +191,25 @@ def test_photos_are_listed_in_natural_order(tmp_path):
     (tmp_path / "folder.png").mkdir()
     assert [p.name for p in list_photos(tmp_path)] == ["IMG1.JPG", "img2.png", "img2b.png", "img10.png"]
     assert natural_key("a²") < natural_key("b")
+
+
+def test_photos_of_several_folders_are_listed_folder_by_folder(tmp_path):
+    for name in ("p10/a.jpg", "p2/b.jpg", "p2/a.jpg", "p2/thumbs/a.jpg", ".trash/c.jpg", "p2/.d.jpg"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    names = [photo_name(path, tmp_path) for path in list_photos(tmp_path)]
+    assert names == ["p2/a.jpg", "p2/b.jpg", "p10/a.jpg"]
+    (tmp_path / "own.jpg").write_bytes(b"")
+    assert [photo_name(path, tmp_path) for path in list_photos(tmp_path)] == ["own.jpg"]
+
+
+@pytest.mark.parametrize("other", ["masks", "images_4", "train", "depth-maps", "input"])
+def test_folders_of_a_data_set_are_not_mixed(tmp_path, other):
+    for name in (other, "images", "video"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match="there are some in images/, give that folder"):
+        list_photos(tmp_path)
 
 
 def test_folders_without_photos_are_refused(tmp_path, caplog):

@@ -177,6 +177,24 @@ def verdicts_of(folder: Path, tmp_path: Path, code: int) -> tuple[dict, dict[str
     return record, {photo["name"]: photo["verdict"] for photo in record["photos"]}
 
 
+def test_photos_of_two_folders_with_the_same_names_are_one_model(photos, tmp_path):
+    both = tmp_path / "both"
+    for k, path in enumerate(sorted(photos.iterdir())):
+        side = both / ("left" if k % 2 == 0 else "right")
+        side.mkdir(parents=True, exist_ok=True)
+        path.rename(side / f"{k // 2}.jpg")
+    (both / "right" / "3.jpg").write_bytes(b"no photo")
+    record, verdicts = verdicts_of(both, tmp_path, 0)
+    assert record["components"] == [6]
+    assert list(verdicts) == [f"{side}/{k}.jpg" for side in ("left", "right") for k in range(3)] + ["right/3.jpg"]
+    views = read_colmap(tmp_path / "out" / "sparse" / "0").views
+    assert sorted(view.name for view in views) == sorted(verdicts)[:-1]
+    assert (tmp_path / "out" / "report.html").is_file()
+    model = reconstruct(both, cameras="per-folder", threads=2).model
+    assert model is not None
+    assert len(model.cameras) == 2
+
+
 def test_the_same_photo_saved_anew_is_no_model_and_no_focal_length(photos, tmp_path):
     with Image.open(photos / "house_00.jpg") as image:
         for k, path in enumerate(sorted(photos.iterdir())[1:4]):

@@ -45,7 +45,7 @@ def detected_photos(scene: SyntheticScene) -> list[DetectedPhoto]:
         n = len(keypoints)
         features = Features(keypoints, np.ones(n), np.zeros(n), noisy, np.zeros((n, 3), dtype=np.uint8))
         info = PhotoInfo(Path(scene.graph.names[v]), 640, 480, 1, ExifFacts())
-        photos.append(DetectedPhoto(info, features, str(v)))
+        photos.append(DetectedPhoto(scene.graph.names[v], info, features, str(v)))
     return photos
 
 

@@ -131,7 +131,8 @@ def with_masks(scene: PosedScene, split: Split, masks: Path) -> PosedScene:
         InputError: No such folder, no mask for any photo, or a mask of another size than its photo.
     """
     paths = _paths(scene.photos)
-    found = find_masks(masks, [paths[i] for i in np.concatenate([split.train, split.test]).tolist()])
+    asked = [paths[i] for i in np.concatenate([split.train, split.test]).tolist()]
+    found = find_masks(masks, {path.name: path for path in asked})
     return replace(scene, photos=replace(scene.photos, masks=tuple(found.get(path) for path in paths)))
 
 

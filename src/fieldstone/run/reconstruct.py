@@ -14,6 +14,7 @@ import numpy as np
 from fieldstone import __version__
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import is_given_matches_folder
+from fieldstone.io.images.photos import photo_name
 from fieldstone.io.posed.model_photos import photos_of_model
 from fieldstone.mapping.grading.grade import grade_run
 from fieldstone.progress import OnProgress, Progress, silent
@@ -170,7 +171,7 @@ def run_record(
 ) -> RunRecord:
     """What `run.json` tells of a run."""
     model = run.reconstruction
-    verdicts = (*_verdicts_on_views(run, photos), *_verdicts_on_problems(run, photos))
+    verdicts = (*_verdicts_on_views(run, photos), *_verdicts_on_problems(run, photos, source))
     return RunRecord(
         version=__version__,
         input=source.resolve().name,
@@ -210,12 +211,12 @@ def _verdicts_on_views(run: MappingRun, photos: MatchedPhotos) -> Iterator[Photo
         )
 
 
-def _verdicts_on_problems(run: MappingRun, photos: MatchedPhotos) -> Iterator[PhotoVerdict]:
+def _verdicts_on_problems(run: MappingRun, photos: MatchedPhotos, source: Path) -> Iterator[PhotoVerdict]:
     """Of every file that is no photo to work with."""
     for problem in photos.problems:
-        if problem.path.name not in run.verdicts:
-            # Not every file name is text.
-            name = problem.path.name.encode(errors="backslashreplace").decode()
+        name = photo_name(problem.path, source)
+        if name not in run.verdicts:
+            name = name.encode(errors="backslashreplace").decode()  # not every file name is text
             yield PhotoVerdict(name, registered=False, verdict=f"{problem.kind}: {problem.reason}", points=0)
 
 

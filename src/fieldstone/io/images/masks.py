@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from fieldstone.errors import InputError
-from fieldstone.io.images.photos import PHOTO_SUFFIXES, Photo, PhotoInfo, read_photo, read_photo_info, turned_upright
+from fieldstone.io.images.photos import (
+    PHOTO_SUFFIXES,
+    Photo,
+    PhotoInfo,
+    photo_name,
+    read_photo,
+    read_photo_info,
+    turned_upright,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -25,33 +33,40 @@ MIN_KEPT = 0.05
 """Masks that keep a smaller share of their photos may have black and white the wrong way round."""
 
 
-def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
+def find_masks(folder: Path, photos: Mapping[str, Path]) -> dict[Path, Path]:
     """The mask of every photo that has one: for `a.jpg` it is `a.jpg.png`, `a.jpg` or `a.png`, in this order.
+
+    Args:
+        photos: By name; a name that leads through folders leads through folders of the same names here.
 
     Raises:
         InputError: No such folder, no mask in it for any of the photos, or a mask of another size than its photo.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; `masks` names the folder that holds one mask for each photo")
-    files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES)
-    by_name = {path.name: path for path in files}
-    by_stem = {path.stem: path for path in files}
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES)
+    by_name = {photo_name(path, folder): path for path in files}
+    by_stem = {_without_suffix(name): path for name, path in by_name.items()}
     found = {}
-    for photo in photos:
-        mask = by_name.get(f"{photo.name}.png") or by_name.get(photo.name) or by_stem.get(photo.stem)
+    for name, photo in photos.items():
+        mask = by_name.get(f"{name}.png") or by_name.get(name) or by_stem.get(_without_suffix(name))
         if mask is not None:
             found[photo] = mask
     if photos and not found:
-        example = photos[0]
+        example = next(iter(photos))
         raise InputError(
-            f"{folder}: no mask for any of {len(photos)} photos; the mask of {example.name} is looked for as "
-            f"{example.name}.png, {example.name} or {example.stem}.png"
+            f"{folder}: no mask for any of {len(photos)} photos; the mask of {example} is looked for as "
+            f"{example}.png, {example} or {_without_suffix(example)}.png"
         )
-    without = [photo.name for photo in photos if photo not in found]
+    without = [name for name, photo in photos.items() if photo not in found]
     if without:
         logger.warning("%d of %d photos have no mask and are used whole: %s", len(without), len(photos), without[:5])
     _check_sizes(found)
     return found
+
+
+def _without_suffix(name: str) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix()
 
 
 def read_mask(path: Path, photo: PhotoInfo) -> Bool[np.ndarray, "h w"]:

@@ -34,6 +34,10 @@ ADVICE = "convert them to JPEG" if HAS_HEIC else "convert them to JPEG (for HEIC
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", *(("HEIF",) if HAS_HEIC else ()))
 """The only decoders that a photo may reach."""
 MAX_MEGAPIXELS = 250.0
+ORIGINALS = "images"
+"""Where data sets keep their photos."""
+LAYOUT_FOLDERS = (ORIGINALS, "input", "train", "test", "val", "mask", "masks", "depth", "depths", "normals", "renders")
+"""First words of the names of folders that data sets consist of."""
 
 UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -118,6 +122,9 @@ def natural_key(name: str) -> tuple:
 def list_photos(folder: Path) -> list[Path]:
     """The photos of a folder in natural order of their names; hidden files are no photos.
 
+    A folder without photos of its own may have them in several folders, as of two cameras or days: then they are the
+    photos of all of these. Pictures that lie beside photos in a folder below are none: masks, thumbnails, renders.
+
     Raises:
         InputError: No such folder, or no photo in it.
     """
@@ -129,15 +136,30 @@ def list_photos(folder: Path) -> list[Path]:
     if unreadable:
         logger.warning("%s: %d files cannot be read, %s: %s", folder, len(unreadable), ADVICE, unreadable[:5])
     if not photos:
+        below = [p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _has_photos(p)]
+        below.sort(key=lambda p: natural_key(p.name))
+        if len(below) > 1 and not any(_is_of_a_layout(p.name) for p in below):
+            logger.info("photos of %d folders: %s", len(below), ", ".join(p.name for p in below))
+            return [photo for each in below for photo in list_photos(each)]
         reason = f"only formats that cannot be read; {ADVICE}" if unreadable else "no photo"
-        below = sorted(p.name for p in folder.iterdir() if p.is_dir() and _has_photos(p))
-        where = f"; there are some in {below[0]}/, give that folder" if below else ""
+        best = min(below, key=lambda p: p.name != ORIGINALS, default=None)
+        where = f"; there are some in {best.name}/, give that folder" if best else ""
         raise InputError(f"{folder}: {reason}{where} (read: {', '.join(PHOTO_SUFFIXES)})")
     return sorted(photos, key=lambda p: natural_key(p.name))
 
 
+def photo_name(path: Path, folder: Path) -> str:
+    """The name of a photo: its path below the folder, with `/`; its last part if it lies elsewhere."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
 def _has_photos(folder: Path) -> bool:
-    return any(p.suffix.lower() in PHOTO_SUFFIXES for p in folder.iterdir())
+    return any(p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".") for p in folder.iterdir())
+
+
+def _is_of_a_layout(name: str) -> bool:
+    """Whether a folder is named as one of a data set: others beside it hold the same photos again, or none."""
+    return re.split(r"[_\W\d]", name.casefold())[0] in LAYOUT_FOLDERS
 
 
 def read_photo_info(path: Path, *, max_megapixels: float = MAX_MEGAPIXELS) -> PhotoInfo:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -34,6 +34,8 @@ PANORAMA = "a panorama, as its XMP says: no camera that takes photos in a plane 
 class DetectedPhoto:
     """A photo whose features are known; its pixels are not kept."""
 
+    name: str
+    """Its path below the folder of the photos."""
     info: PhotoInfo
     features: Features
     key: str
@@ -81,15 +83,18 @@ class DetectedPhoto:
 
 
 def detect(
-    paths: Sequence[Path],
+    paths: Mapping[str, Path],
     options: MatchingOptions,
     cache: UnitCache,
     on_progress: OnProgress = silent,
 ) -> tuple[list[DetectedPhoto], list[PhotoProblem]]:
-    """Features of every readable photo, in the order of the paths, and the files that are not used.
+    """Features of every readable photo, in the order given, and the files that are not used.
 
     Of several photos with the same content only the first is used: the others would count its observations twice.
     Decoding and extraction release the interpreter lock. A photo is let go as soon as its features are known.
+
+    Args:
+        paths: Photos by name.
 
     Raises:
         InputError: The masks do not fit the photos.
@@ -98,24 +103,26 @@ def detect(
     masks = {} if options.masks is None else find_masks(options.masks, paths)
     progress = StageProgress(on_progress, "finding features", len(paths))
 
-    def one(path: Path) -> DetectedPhoto | PhotoProblem:
-        return _detected(path, masks.get(path), extractor, cache)
+    def one(name: str) -> DetectedPhoto | PhotoProblem:
+        return _detected(name, paths[name], masks.get(paths[name]), extractor, cache)
 
     # A photo for each thread, until there are fewer photos than threads.
-    together = len(paths) - len(paths) % options.threads
+    names, together = list(paths), len(paths) - len(paths) % options.threads
     with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
-        results = list(progress.each(pool.map(one, paths[:together])))
+        results = list(progress.each(pool.map(one, names[:together])))
     with opencv_threads(options.threads):
-        results += list(progress.each(map(one, paths[together:])))
+        results += list(progress.each(map(one, names[together:])))
     photos, problems = _without_copies(results)
     cache.forget_others(STAGE, [photo.key for photo in photos])
     check_polarity([photo.kept for photo in photos if photo.info.path in masks])
     return photos, problems
 
 
-def _detected(path: Path, mask: Path | None, extractor: Sift, cache: UnitCache) -> DetectedPhoto | PhotoProblem:
+def _detected(
+    name: str, path: Path, mask: Path | None, extractor: Sift, cache: UnitCache
+) -> DetectedPhoto | PhotoProblem:
     """Features of one photo, found in the cache or in its pixels; or why it is not used."""
-    bad_name = name_problem(path.name)
+    bad_name = name_problem(name)
     if bad_name is not None:
         return PhotoProblem(path, f"{bad_name}; rename it", "not used")
     try:
@@ -126,7 +133,7 @@ def _detected(path: Path, mask: Path | None, extractor: Sift, cache: UnitCache) 
         return _unusable(path, error)
     if info.panorama:
         return PhotoProblem(path, PANORAMA, "not used")
-    photo = DetectedPhoto(info, Features.none(), key, mask=mask)
+    photo = DetectedPhoto(name, info, Features.none(), key, mask=mask)
     if unit is not None:
         return replace(photo, features=Features(**unit.arrays), **unit.facts)
     try:
@@ -169,7 +176,7 @@ def _without_copies(
         kept[chosen] = stays
         for k in (k for k in same if k != chosen):
             how = "byte for byte" if photos[k].key == stays.key else "pixel for pixel, though the files differ"
-            reason = f"duplicate of {stays.info.path.name}, {how}"
+            reason = f"duplicate of {stays.name}, {how}"
             problems.append(PhotoProblem(photos[k].info.path, reason, "not used"))
     return [kept[k] for k in sorted(kept)], problems
 

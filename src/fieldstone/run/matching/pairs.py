@@ -41,7 +41,7 @@ def match_pairs(
     packing = Packing(lambda rows: Unit({"rows": rows}), lambda unit: unit.arrays["rows"])
     matches = resumed(cache, "matches", keys, pairs, work, packing)
     return MatchGraph(
-        tuple(photo.info.path.name for photo in photos),
+        tuple(photo.name for photo in photos),
         tuple(photo.features.keypoints for photo in photos),
         tuple(photo.features.colors for photo in photos),
         {pair: rows for pair, rows in zip(pairs, matches, strict=True) if len(rows)},

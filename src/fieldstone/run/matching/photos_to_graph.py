@@ -17,7 +17,7 @@ from fieldstone.features.pairs import choose_pairs
 from fieldstone.geometry.camera import Camera
 from fieldstone.io.files.cache import UnitCache
 from fieldstone.io.given_matches.matching_txt import read_given_matches
-from fieldstone.io.images.photos import PhotoProblem, list_photos, read_photo
+from fieldstone.io.images.photos import PhotoProblem, list_photos, photo_name, read_photo
 from fieldstone.mapping.model.calibration import FOCAL_SIGMA
 from fieldstone.progress import OnProgress, silent
 from fieldstone.report.figures import PhotoByName
@@ -71,7 +71,7 @@ def read_matched_photos(folder: Path) -> MatchedPhotos:
         cameras=(camera,),
         camera_of_image=np.zeros(given.graph.num_images, dtype=np.int64),
         focal_sigma=np.zeros(1),
-        photo_of=photos_on_disk([path for path in given.photos if path is not None]),
+        photo_of=photos_on_disk({path.name: path for path in given.photos if path is not None}),
         problems=given.problems,
         seconds={"reading": time.perf_counter() - start},
     )
@@ -86,13 +86,13 @@ def match_photos(
         InputError: Fewer than two photos can be read, or most of them are panoramas.
     """
     stop, seconds = _stopwatch()
-    paths = list_photos(folder)
+    paths = {photo_name(path, folder): path for path in list_photos(folder)}
     photos, problems = detect(paths, options, cache, on_progress)
     _refuse_panoramas(folder, problems, len(paths))
     for problem in problems:
-        logger.warning("skipped %r: %s", problem.path.name, problem.reason)
+        logger.warning("skipped %r: %s", photo_name(problem.path, folder), problem.reason)
     if len(photos) < 2:
-        reasons = "".join(f"; {problem.path.name}: {problem.reason}" for problem in problems[:3])
+        reasons = "".join(f"; {photo_name(problem.path, folder)}: {problem.reason}" for problem in problems[:3])
         raise InputError(
             f"{folder}: a reconstruction needs at least two different readable photos, found {len(photos)}{reasons}; "
             "add photos"
@@ -110,8 +110,8 @@ def match_photos(
     graph = verify(graph, photos, cameras, camera_of_image, options, seed, cache, on_progress)
     stop("verification")
     exact = np.array([options.fix_intrinsics and source == "given" for source in found.source])
-    photo_of = photos_on_disk([info.path for info in infos])
-    sharpness = {photo.info.path.name: photo.sharpness for photo in photos}
+    photo_of = photos_on_disk({photo.name: photo.info.path for photo in photos})
+    sharpness = {photo.name: photo.sharpness for photo in photos}
     return MatchedPhotos(
         graph,
         cameras,
@@ -147,9 +147,8 @@ def _putative(
     return match_pairs(photos, pairs, options, cache, on_progress)
 
 
-def photos_on_disk(paths: Sequence[Path]) -> PhotoByName:
+def photos_on_disk(by_name: Mapping[str, Path]) -> PhotoByName:
     """Photos by name, decoded when they are asked for, no finer than figures need; the last few are kept."""
-    by_name = {path.name: path for path in paths}
 
     @lru_cache(maxsize=8)
     def photo_of(name: str) -> np.ndarray | None:
