@@ -101,12 +101,8 @@ def detect(
     def one(path: Path) -> DetectedPhoto | PhotoProblem:
         return _detected(path, masks.get(path), extractor, cache)
 
-    # A photo for each thread, until there are fewer photos than threads.
-    together = len(paths) - len(paths) % options.threads
     with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
-        results = list(progress.each(pool.map(one, paths[:together])))
-    with opencv_threads(options.threads):
-        results += list(progress.each(map(one, paths[together:])))
+        results = list(progress.each(pool.map(one, paths)))
     photos, problems = _without_copies(results)
     cache.forget_others(STAGE, [photo.key for photo in photos])
     check_polarity([photo.kept for photo in photos if photo.info.path in masks])
