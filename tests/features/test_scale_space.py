@@ -108,6 +108,7 @@ def test_the_extremum_of_a_parabola_is_found_exactly(start):
     centre = np.array([8.2, 7.3, 1.9])
     H = np.array([[-3.0, 0.4, 0.2], [0.4, -2.0, -0.3], [0.2, -0.3, -1.5]])
     found = refined(parabola(centre, H, 20.0), start, 1.0, 10.0)
+    assert found is not None
     # Values of about 100 in float32.
     np.testing.assert_allclose(found, [*centre, 20.0], atol=1e-4)
 
