@@ -1,11 +1,13 @@
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from fieldstone.features.sift import DESCRIPTOR_SCALE, Sift, SiftOptions, reduced_grey, root_sift, spread
+from fieldstone.features.descriptors_numba import DESCRIPTOR_SCALE
+from fieldstone.features.sift import Sift, SiftOptions, reduced_grey, spread
 from fieldstone.run.matching.detection import opencv_threads
 
 
@@ -64,16 +66,56 @@ def test_angles_turn_with_the_photo():
     assert np.mean(same.any(axis=1)) > 0.8
 
 
-def test_descriptors_are_square_roots_of_shares():
-    rng = np.random.default_rng(0)
-    raw = rng.integers(0, 160, size=(50, 128)).astype(np.uint8)
-    raw[3] = 0
-    found = root_sift(raw)
-    shares = raw[0] / raw[0].sum()
-    np.testing.assert_array_equal(found[0], np.rint(512 * np.sqrt(shares)))
-    assert not found[3].any()
-    norms = np.linalg.norm(found[[0, 1, 2, 4]].astype(float), axis=1)
-    np.testing.assert_allclose(norms, DESCRIPTOR_SCALE, rtol=2e-3)
+def test_descriptors_turn_with_the_photo():
+    image = texture(1, 240, 240)
+    upright, turned = Sift()(image), Sift()(np.ascontiguousarray(np.rot90(image)))
+    moved = np.stack([upright.keypoints[:, 1], 240 - upright.keypoints[:, 0]], axis=1)
+    distance = np.linalg.norm(moved[:, None] - turned.keypoints[None], axis=2)
+    turn = np.angle(np.exp(1j * (turned.angle[None] - upright.angle[:, None] + np.pi / 2)))
+    a, b = np.nonzero((distance < 0.05) & (np.abs(turn) < 0.02))
+    between = np.linalg.norm(upright.descriptors[a].astype(float) - turned.descriptors[b].astype(float), axis=1)
+    assert len(a) > 0.7 * len(upright)
+    # Unrelated ones are some 400 apart.
+    assert np.median(between) < 15
+
+
+def test_keypoints_grow_with_the_photo():
+    small = texture(2, 160, 120)
+    size = 320, 240
+    large = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    options = SiftOptions(scarce=0)
+    a, b = Sift(options)(small), Sift(options)(large)
+    # Compared where both are seen well: not as small as pixels, not so large that octaves end.
+    a = a[(a.scale > 1.5) & (a.scale < 6.0)]
+    ratio = np.log2(b.scale[None] / (2 * a.scale[:, None]))
+    distance = np.linalg.norm(2 * a.keypoints[:, None] - b.keypoints[None], axis=2) / b.scale[None]
+    assert np.mean(((distance < 0.2) & (np.abs(ratio) < 0.1)).any(axis=1)) > 0.85
+
+
+def opencv_sift(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Keypoints (corner convention), scales, angles and RootSIFT descriptors of OpenCV."""
+    sift = cv2.SIFT.create(contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True)
+    found, raw = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    xy, size, angle = (np.array([getattr(k, name) for k in found]) for name in ("pt", "size", "angle"))
+    root = DESCRIPTOR_SCALE * np.sqrt(raw / raw.sum(axis=1, keepdims=True))
+    return xy + 0.5, size / 2, np.deg2rad(angle), np.minimum(root, 255)
+
+
+def test_opencv_finds_most_of_the_same_and_describes_it_alike():
+    image = texture(4, 400, 300)
+    ours = Sift(SiftOptions(max_features=10**6, scarce=0))(image)
+    xy, scale, angle, descriptors = opencv_sift(image)
+    distance = np.linalg.norm(ours.keypoints[:, None] - xy[None], axis=2)
+    same_scale = np.abs(np.log2(ours.scale[:, None] / scale[None])) < 0.15
+    same_place = (distance < 0.5) & same_scale
+    assert np.mean(same_place.any(axis=1)) > 0.7
+    assert np.mean(same_place.any(axis=0)) > 0.7
+    turn = np.angle(np.exp(1j * (ours.angle[:, None] - angle[None])))
+    a, b = np.nonzero(same_place & (np.abs(turn) < 0.1))
+    between = np.linalg.norm(ours.descriptors[a].astype(float) - descriptors[b], axis=1)
+    assert len(a) > 0.5 * len(ours)
+    # Unrelated ones are some 400 apart.
+    assert np.median(between) < 70
 
 
 def test_no_region_starves_and_the_strongest_of_each_cell_stay():
@@ -197,16 +239,16 @@ def test_a_smaller_picture_of_the_photo_gives_features_in_its_pixels():
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_threads_of_opencv_change_nothing(threads):
-    image = texture(5, 640, 480)
+def test_photos_in_threads_side_by_side_give_the_same_bytes(threads):
+    images = [texture(seed, 640, 480) for seed in range(5, 9)]
     extractor = Sift(SiftOptions(max_features=300))
-    with opencv_threads(1):
-        alone = extractor(image)
-    with opencv_threads(threads):
-        found = extractor(image)
+    alone = [extractor(image) for image in images]
+    with opencv_threads(threads), ThreadPoolExecutor(threads) as pool:
         assert cv2.getNumThreads() == threads
-    np.testing.assert_array_equal(found.keypoints, alone.keypoints)
-    np.testing.assert_array_equal(found.descriptors, alone.descriptors)
+        together = list(pool.map(extractor, images))
+    for one, other in zip(alone, together, strict=True):
+        for name in ("keypoints", "scale", "angle", "descriptors", "colors"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def faint_blobs() -> tuple[np.ndarray, np.ndarray]:

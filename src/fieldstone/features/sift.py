@@ -8,12 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
+from fieldstone.features.keypoints import find_keypoints
 from fieldstone.scene.features import Features
 
-DESCRIPTOR_SCALE = 512.0
-"""RootSIFT descriptors have unit length; as uint8 they are multiplied by this and clipped at 255."""
-CANDIDATES = 1.6
-"""Times `max_features`: so many of the strongest compete for their place in the photo."""
 ENLARGED = 2.0
 """Factor by which photos are enlarged to find faint features, so small that the detector's own doubling misses them."""
 
@@ -140,45 +137,26 @@ class Sift:
             size: (width, height) of the photo, in whose pixels the features are given.
             keep: As for the call.
         """
-        # OpenCV does not know of `keep` when it chooses the strongest.
-        detector = self._detector(round(CANDIDATES * self.options.max_features) if keep is None else 0)
         # Each axis of the photo was reduced by its own, rounded, factor.
         zoom = np.array(size) / np.array([grey.shape[1], grey.shape[0]])
-        # In one call, since a pyramid costs as much as thousands of descriptors.
-        found, described = detector.detectAndCompute(grey, None)
-        if not found:
+        found = find_keypoints(grey, self.options.contrast_threshold, self.options.edge_threshold)
+        if keep is not None:
+            found = found[at_pixels(keep, found.xy * zoom)]
+        # Features of one place only push others out: those that would not have been chosen alone are not among them.
+        found = found[np.sort(spread(found.xy, found.contrast, grey.shape, self.options))]
+        if not len(found):
             return Features.none()
-        # OpenCV: centre of the first pixel at (0, 0), diameters, degrees.
-        xy = np.array([k.pt for k in found], dtype=np.float64) + 0.5
-        radius = np.array([k.size for k in found], dtype=np.float64) / 2
-        angle = np.deg2rad(np.array([k.angle for k in found], dtype=np.float64))
-        response = np.array([k.response for k in found], dtype=np.float64)
-
-        allowed = np.arange(len(xy)) if keep is None else np.flatnonzero(at_pixels(keep, xy * zoom))
-        if not len(allowed):
-            return Features.none()
-        chosen = allowed[spread(xy[allowed], response[allowed], grey.shape, self.options)]
-        order = chosen[np.lexsort((angle[chosen], xy[chosen, 0], xy[chosen, 1], -radius[chosen]))]
-        pixels = np.clip(xy[order] * zoom, 0.0, size)
+        found, angle = found.oriented()
+        chosen = spread(found.xy, found.contrast, grey.shape, self.options)
+        order = chosen[np.lexsort((angle[chosen], found.xy[chosen, 0], found.xy[chosen, 1], -found.scale[chosen]))]
+        found, angle = found[order], angle[order]
+        pixels = np.clip(found.xy * zoom, 0.0, size)
         return Features(
             keypoints=pixels,
-            scale=radius[order] * float(np.sqrt(zoom.prod())),
-            angle=angle[order],
-            descriptors=root_sift(np.asarray(described, dtype=np.uint8)[order]),
+            scale=found.scale * float(np.sqrt(zoom.prod())),
+            angle=angle,
+            descriptors=found.described(angle),
             colors=at_pixels(image, pixels * (np.array([image.shape[1], image.shape[0]]) / np.array(size))),
-        )
-
-    def _detector(self, max_features: int) -> cv2.SIFT:
-        """OpenCV's detector for so many of the strongest features; 0: all."""
-        return cv2.SIFT.create(
-            nfeatures=max_features,
-            nOctaveLayers=3,
-            contrastThreshold=self.options.contrast_threshold,
-            edgeThreshold=self.options.edge_threshold,
-            sigma=1.6,
-            descriptorType=cv2.CV_8U,
-            # Without it the doubled first octave is half a pixel off, and every keypoint a quarter.
-            enable_precise_upscale=True,
         )
 
 
@@ -210,17 +188,6 @@ def spread(
     rank = np.empty(len(xy), dtype=np.int64)
     rank[by_cell] = np.arange(len(xy)) - first_of_cell[cell[by_cell]]
     return np.lexsort((xy[:, 0], xy[:, 1], -response, rank))[: options.max_features]
-
-
-def root_sift(descriptors: UInt8[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:
-    """Square roots of the descriptors' shares, times 512: Euclidean distance then is Hellinger's.
-
-    Source:
-        `arandjelovic2012`, section 3.
-    """
-    values = descriptors.astype(np.float32)
-    shares = values / np.maximum(values.sum(axis=1, keepdims=True), 1.0)
-    return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(shares)), 255.0).astype(np.uint8)
 
 
 def at_pixels(image: Shaped[np.ndarray, "h w *c"], pixels: Float[np.ndarray, "n 2"]) -> Shaped[np.ndarray, "n *c"]:

@@ -106,12 +106,8 @@ def detect(
     def one(name: str) -> DetectedPhoto | PhotoProblem:
         return _detected(name, paths[name], masks.get(paths[name]), extractor, cache)
 
-    # A photo for each thread, until there are fewer photos than threads.
-    names, together = list(paths), len(paths) - len(paths) % options.threads
     with opencv_threads(1), ThreadPoolExecutor(options.threads) as pool:
-        results = list(progress.each(pool.map(one, names[:together])))
-    with opencv_threads(options.threads):
-        results += list(progress.each(map(one, names[together:])))
+        results = list(progress.each(pool.map(one, paths)))
     photos, problems = _without_copies(results)
     cache.forget_others(STAGE, [photo.key for photo in photos])
     check_polarity([photo.kept for photo in photos if photo.info.path in masks])

@@ -104,11 +104,10 @@ class Rematcher:
         features = [photo.features for photo in self.photos]
         keypoints, colors = list(graph.keypoints), list(graph.colors)
         photos = unregistered.photos[:MAX_RECOVERED]
-        for v in photos:
-            with opencv_threads(self.options.threads):
-                features[v] = richer(*self.photos[v].pixels())
-            keypoints[v] = features[v].keypoints
-            colors[v] = features[v].colors
+        with opencv_threads(1), ThreadPoolExecutor(self.options.threads) as pool:
+            found = list(pool.map(lambda v: richer(*self.photos[v].pixels()), photos))
+        for v, of_photo in zip(photos, found, strict=True):
+            features[v], keypoints[v], colors[v] = of_photo, of_photo.keypoints, of_photo.colors
         graph = replace(
             graph,
             keypoints=tuple(keypoints),
