@@ -3,8 +3,7 @@
 A row needs r + 1 products and 2 r sums per pixel and direction. Eight pixels go through one instruction, so what is
 added to must not be read and written for every one of them: pairs of pixels at equal distances come four at a time.
 
-`contract` lets a product and a sum become one instruction with one rounding. The order of sums is as written, so
-results depend on neither the number of threads nor the run.
+The order of sums is as written, so results depend on neither the number of threads nor the run.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numba import njit
 REACH = 4.0
 """Standard deviations at which the weights of a blur end, but for one pixel."""
 
-KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+KERNEL = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 def gaussian_weights(sigma: float) -> Float[np.ndarray, "r"]:
