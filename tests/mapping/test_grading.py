@@ -125,6 +125,18 @@ def test_a_folded_building_is_doubtful():
     assert found.matches_kept < 0.95
 
 
+@pytest.mark.parametrize("silent", [None, "error_added", "lost", "denied", "turned"])
+def test_what_is_off_by_every_measure_is_doubtful_though_far_off_by_none(silent):
+    model, graph = ordinary_building()
+    bent = with_poses(
+        model, {k: model.pose_of(k) @ Rigid3(exp(np.array([0.0, 0.0, 0.3])), np.zeros(3)) for k in (3, 4)}
+    )
+    limits = dict.fromkeys(("error_added", "lost", "denied", "turned"), Limits(0.0, 1.0))
+    limits |= {} if silent is None else {silent: Limits(1.0, 1.0)}
+    word = grade(bent, graph, options=replace(OPTIONS, **limits, contradicted=Limits(0.0, 1.0))).word
+    assert word == ("doubtful" if silent is None else "weak")
+
+
 def test_a_mirrored_model_is_doubtful():
     model, graph = ordinary_building()
     flip = np.diag([1.0, 1.0, -1.0])

@@ -204,7 +204,7 @@ def _is_vague(run: MappingRun, camera: int, max_focal_sd: float) -> bool:
 
 
 def _of_matches(table: _Table, options: GradingOptions) -> Iterator[GradeReason]:
-    """What all pairs together say."""
+    """What all pairs together say. What is off by every measure is doubtful, though it be far off by none."""
     advice = "check that photos of one camera share zoom and lens, that nothing in them stands still, and their EXIF"
     if word := _word(table.error_added, options.error_added):
         yield GradeReason(word, f"{table.error_added:.0%} of the matches' error is the model's, not theirs", advice)
@@ -216,6 +216,10 @@ def _of_matches(table: _Table, options: GradingOptions) -> Iterator[GradeReason]
     if word := _word(table.turned, options.turned):
         reason = f"{table.turned:.0%} of the matches want their photos turned by over {options.min_turn_deg:g} degrees"
         yield GradeReason(word, reason, advice)
+    shares = (table.error_added, table.lost, table.denied, table.turned)
+    limits = (options.error_added, options.lost, options.denied, options.turned)
+    if all(map(_word, shares, limits)):
+        yield GradeReason("doubtful", "by every measure the matches speak against the model", advice)
 
 
 def _of_photos(
