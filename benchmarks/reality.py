@@ -22,6 +22,7 @@ from typing import Literal
 
 import numpy as np
 
+from benchmarks.data import DATA
 from benchmarks.real_sets import Input, RealSet, chosen
 from benchmarks.rows import QUALITY, TIMES, Better, Row, add_out_option, write_rows
 from benchmarks.truth_errors import LooseCounts, TruthErrors, loose_counts, truth_errors
@@ -130,7 +131,8 @@ def reconstruct_set(each: RealSet, seed: int, keep: Path, threads: int) -> Outco
         matched, given = matched_of(source, options, cache)
         mapper, run = run_mapper(matched, options, MapperCheckpoints(UnitCache()), silent, given=given)
     except InputError as error:
-        return Outcome(each.name, each.half, each.expected, seed, time.perf_counter() - start, refused=str(error))
+        why = str(error).replace(f"{DATA}/", "")
+        return Outcome(each.name, each.half, each.expected, seed, time.perf_counter() - start, refused=why)
     seconds = time.perf_counter() - start
     record = run_record(Path(each.name), mapper, run, matched, graded(run, matched, options), seed, {})
     models = (run.reconstruction, *run.others)
