@@ -44,6 +44,11 @@ def test_photos_of_one_name_in_two_folders_have_masks_of_their_own(tmp_path):
         write_mask(tmp_path / "masks" / f"{name}.png", np.full((6, 8), 255))
     found = find_masks(tmp_path / "masks", photos)
     assert found == {path: tmp_path / "masks" / f"{name}.png" for name, path in photos.items()}
+    write_mask(tmp_path / "flat" / "a.jpg.png", np.full((6, 8), 255))
+    with pytest.raises(InputError, match="no mask for any"):  # whose would it be?
+        find_masks(tmp_path / "flat", photos)
+    left = {"left/a.jpg": photos["left/a.jpg"]}
+    assert find_masks(tmp_path / "flat", left) == {photos["left/a.jpg"]: tmp_path / "flat" / "a.jpg.png"}
 
 
 def test_white_is_kept_whatever_the_grey_levels(tmp_path, photo):

@@ -131,8 +131,8 @@ def with_masks(scene: PosedScene, split: Split, masks: Path) -> PosedScene:
         InputError: No such folder, no mask for any photo, or a mask of another size than its photo.
     """
     paths = _paths(scene.photos)
-    asked = [paths[i] for i in np.concatenate([split.train, split.test]).tolist()]
-    found = find_masks(masks, {path.name: path for path in asked})
+    asked = np.concatenate([split.train, split.test]).tolist()
+    found = find_masks(masks, {scene.photos.names[i]: paths[i] for i in asked})
     return replace(scene, photos=replace(scene.photos, masks=tuple(found.get(path) for path in paths)))
 
 

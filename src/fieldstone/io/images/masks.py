@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -37,7 +38,8 @@ def find_masks(folder: Path, photos: Mapping[str, Path]) -> dict[Path, Path]:
     """The mask of every photo that has one: for `a.jpg` it is `a.jpg.png`, `a.jpg` or `a.png`, in this order.
 
     Args:
-        photos: By name; a name that leads through folders leads through folders of the same names here.
+        photos: By name. One that leads through folders leads through folders of the same names here; without these its
+            last part is enough, if no other photo has the same.
 
     Raises:
         InputError: No such folder, no mask in it for any of the photos, or a mask of another size than its photo.
@@ -47,9 +49,13 @@ def find_masks(folder: Path, photos: Mapping[str, Path]) -> dict[Path, Path]:
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES)
     by_name = {photo_name(path, folder): path for path in files}
     by_stem = {_without_suffix(name): path for name, path in by_name.items()}
+    last_part = Counter(PurePosixPath(name).name for name in photos)
     found = {}
     for name, photo in photos.items():
-        mask = by_name.get(f"{name}.png") or by_name.get(name) or by_stem.get(_without_suffix(name))
+        short = PurePosixPath(name).name
+        candidates = [name, short] if last_part[short] == 1 else [name]
+        of_each = ((by_name.get(f"{n}.png"), by_name.get(n), by_stem.get(_without_suffix(n))) for n in candidates)
+        mask = next((mask for masks in of_each for mask in masks if mask is not None), None)
         if mask is not None:
             found[photo] = mask
     if photos and not found:
